@@ -1,0 +1,31 @@
+"""Task domains whose variations share their subroutines, as Gymnasium environments.
+
+Importing this package registers the ids; ``gym.make("progpolicy_envs:Hanoi-v0")`` imports it by itself.
+"""
+
+import gymnasium as gym
+
+from progpolicy_envs.domains import DOMAINS, Domain, get_domain
+
+MAX_EPISODE_STEPS = 500
+
+_ENTRY_POINTS = {
+    "Hanoi-v0": ("progpolicy_envs.hanoi:HanoiEnv", "progpolicy_envs.hanoi:HanoiVectorEnv"),
+}
+
+
+def register_envs() -> None:
+    """Register every id that is not registered yet; nothing heavy is imported."""
+    for env_id, (entry_point, vector_entry_point) in _ENTRY_POINTS.items():
+        if env_id not in gym.registry:
+            gym.register(
+                id=env_id,
+                entry_point=entry_point,
+                vector_entry_point=vector_entry_point,
+                max_episode_steps=MAX_EPISODE_STEPS,
+            )
+
+
+register_envs()
+
+__all__ = ["DOMAINS", "Domain", "get_domain", "register_envs"]

@@ -1,0 +1,55 @@
+"""The domains: ids, training variations and unseen test variations, read by the plugin, the benchmark and the docs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from difflib import get_close_matches
+from itertools import permutations
+
+from progpolicy_envs.variation import Variation
+
+
+@dataclass(frozen=True)
+class Domain:
+    """One task domain.
+
+    :param id: environment id
+    :param size: name of the parameter that makes tasks harder, such as ``n_discs``
+    :param train: the variations to train on, the easiest first
+    :param unseen: the variations to test generalisation on
+    """
+
+    id: str
+    size: str
+    train: tuple[Variation, ...]
+    unseen: tuple[Variation, ...]
+
+
+DOMAINS: dict[str, Domain] = {
+    domain.id: domain
+    for domain in (
+        Domain(
+            id="Hanoi-v0",
+            size="n_discs",
+            train=tuple(
+                {"n_discs": n_discs, "source": source, "target": target}
+                for n_discs in (1, 2, 3, 4)
+                for source, target in permutations(range(3), 2)
+            ),
+            unseen=tuple({"n_discs": n_discs} for n_discs in (5, 6, 7, 8)),
+        ),
+    )
+}
+
+
+def get_domain(env_id: str) -> Domain:
+    """Return the domain of an environment id.
+
+    :param env_id: such as ``"Hanoi-v0"``, with or without a module prefix (``"progpolicy_envs:Hanoi-v0"``)
+    :raises ValueError: if this package has no such environment; the message names the nearest ids
+    """
+    name = env_id.rpartition(":")[2]
+    if name not in DOMAINS:
+        near = get_close_matches(name, DOMAINS, n=3, cutoff=0.3) or list(DOMAINS)
+        raise ValueError(f"{env_id!r} is not one of this package's environments; nearest: {', '.join(near)}")
+    return DOMAINS[name]

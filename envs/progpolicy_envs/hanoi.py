@@ -1,0 +1,306 @@
+"""Hanoi-v0: the Tower of Hanoi with any number of discs behind an observation of fixed size."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from progpolicy_envs.planners import hanoi as planner
+from progpolicy_envs.rendering import Display, hanoi_frame
+from progpolicy_envs.variation import IntParameter, Variation, VariationSpace
+from progpolicy_envs.vector import PlanningVectorEnv
+
+MAX_DISCS = 12
+N_PEGS = 3
+MOVES: tuple[tuple[int, int], ...] = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
+VARIATIONS = VariationSpace(
+    IntParameter("n_discs", 1, MAX_DISCS, "number of discs"),
+    IntParameter("source", 0, N_PEGS - 1, "peg on which all discs start"),
+    IntParameter("target", 0, N_PEGS - 1, "peg to which all discs go; not the source"),
+)
+STEP_REWARD, ILLEGAL_REWARD, GOAL_REWARD = -0.01, -0.05, 1.0
+
+OBSERVATION_NAMES = tuple(f"{feature}[{peg}]" for peg in range(N_PEGS) for feature in ("rank", "colour", "empty"))
+ACTION_NAMES = tuple(f"move {source}->{target}" for source, target in MOVES)
+_OBSERVATION_SPACE = spaces.Box(
+    np.tile(np.float32([-1, -1, 0]), N_PEGS), np.tile(np.float32([1, 1, 1]), N_PEGS), dtype=np.float32
+)
+
+
+def check_variation(variation: Variation) -> Variation:
+    """Return ``variation``.
+
+    :param variation: values of ``n_discs``, ``source`` and ``target``, each in its range
+    :raises ValueError: if source and target are the same peg
+    """
+    if variation["source"] == variation["target"]:
+        raise ValueError(
+            f"source={variation['source']} and target={variation['target']} are not accepted together; "
+            "they are two different pegs from 0 to 2"
+        )
+    return variation
+
+
+class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
+    """Move a tower of discs from one peg to another, one disc at a time, never a larger disc on a smaller one.
+
+    ## Description
+    ``n_discs`` discs of different sizes lie on the source peg, the largest at the bottom. The task is done when all
+    of them lie on the target peg. The least number of moves is ``2**n_discs - 1``.
+
+    ## Action Space
+    ``Discrete(6)``: move the top disc of one peg onto another.
+
+    | Num | Move   | Num | Move   | Num | Move   |
+    |-----|--------|-----|--------|-----|--------|
+    | 0   | 0 -> 1 | 2   | 1 -> 0 | 4   | 2 -> 0 |
+    | 1   | 0 -> 2 | 3   | 1 -> 2 | 5   | 2 -> 1 |
+
+    ## Observation Space
+    ``Box(9,)``, three numbers for each peg, the same for any number of discs. Only what lies on top of a peg counts
+    for the rules, so only that is shown.
+
+    | Num     | Observation | Min | Max | Meaning                                                                  |
+    |---------|-------------|-----|-----|--------------------------------------------------------------------------|
+    | 0, 3, 6 | rank[peg]   | -1  | 1   | size of the top disc among the three tops: -1 smallest, 0 middle,        |
+    |         |             |     |     | 1 largest; an empty peg counts as largest, two empty pegs share 0.5      |
+    | 1, 4, 7 | colour[peg] | -1  | 1   | colour of what is on top; colours alternate with size, the smallest disc |
+    |         |             |     |     | is -1; where the peg is empty, the colour of its base: those of source   |
+    |         |             |     |     | and target continue the alternation, the third base has the other colour |
+    | 2, 5, 8 | empty[peg]  | 0   | 1   | 1 where the peg holds no disc                                            |
+
+    Classical solutions by hand rest on such colours: in a shortest solution a disc is never put onto one of its own
+    colour. Which disc has just been moved cannot be seen; a policy has to remember it.
+
+    ## Rewards
+    -0.01 a step, a further -0.05 for an illegal move, +1 when the last disc reaches the target.
+
+    ## Starting State
+    All discs on the source peg. There is nothing random.
+
+    ## Episode End
+    Terminated when all discs lie on the target peg; truncated after 500 steps (``max_episode_steps``).
+
+    ## Information
+    ``info["is_success"]`` at every step; at reset also ``info["variation"]`` and ``info["optimal_steps"]``.
+
+    ## Arguments
+    ``gym.make("Hanoi-v0", n_discs=5)`` or ``env.reset(options={"n_discs": 5})``; an option stays in force until it
+    is changed. Values that are not accepted raise ``ValueError``.
+
+    | Parameter  | Values  | Default | Meaning                                   |
+    |------------|---------|---------|-------------------------------------------|
+    | n_discs    | 1 to 12 | 3       | number of discs                           |
+    | source     | 0 to 2  | 0       | peg on which all discs start              |
+    | target     | 0 to 2  | 2       | peg to which all discs go; not the source |
+
+    ## References
+    The domain `hanoi` of PDDLGym (Silver and Chitnis, 2020); E. Lucas, *Récréations mathématiques* III (1893).
+
+    ## Version History
+    * v0: initial version
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array", "ansi"], "render_fps": 4}
+    variations: ClassVar[VariationSpace] = VARIATIONS
+    observation_names: ClassVar[tuple[str, ...]] = OBSERVATION_NAMES
+    action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
+
+    def __init__(self, n_discs: int = 3, source: int = 0, target: int = 2, render_mode: str | None = None) -> None:
+        self.variation = check_variation(
+            self.variations.update({}, {"n_discs": n_discs, "source": source, "target": target})
+        )
+        self.observation_space = _OBSERVATION_SPACE
+        self.action_space = spaces.Discrete(len(MOVES))
+        self.render_mode = render_mode
+        self.discs: list[int] = [self.variation["source"]] * self.variation["n_discs"]
+        self._display = Display(self.metadata["render_fps"])
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Put all discs onto the source peg.
+
+        :param seed: seeds the generator; nothing in this environment draws from it
+        :param options: new values of variation parameters; they stay in force
+        :return: observation ``(9,)`` and info
+        :raises ValueError: if a variation is not accepted; the variation in force is then unchanged
+        """
+        super().reset(seed=seed)
+        self.variation = check_variation(self.variations.update(self.variation, options))
+        self.discs = [self.variation["source"]] * self.variation["n_discs"]
+        info = {
+            "is_success": False,
+            "variation": dict(self.variation),
+            "optimal_steps": planner.optimal_steps(self.discs, self.variation["target"]),
+        }
+        self._show()
+        return self._observe(), info
+
+    def step(self, action: np.int64 | int) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Move a disc, if the rules allow it.
+
+        :param action: 0 to 5, see the table above
+        :return: observation, reward, terminated, truncated, info
+        :raises ValueError: if the action is out of range
+        """
+        if not self.action_space.contains(action):
+            raise ValueError(f"action={action!r} is not accepted; actions are integers from 0 to {len(MOVES) - 1}")
+        source, target = MOVES[int(action)]
+        tops = self._tops()
+        reward = STEP_REWARD
+        if tops[source] < tops[target]:
+            self.discs[tops[source]] = target
+        else:
+            reward += ILLEGAL_REWARD
+        solved = all(peg == self.variation["target"] for peg in self.discs)
+        reward += GOAL_REWARD * solved
+        self._show()
+        return self._observe(), reward, solved, False, {"is_success": solved}
+
+    def render(self) -> Any:
+        """Return a picture ``(height, width, 3)`` of bytes, or a text, or show a window, as ``render_mode`` says."""
+        if self.render_mode == "ansi":
+            return self._text()
+        if self.render_mode == "rgb_array":
+            return self._frame()
+        self._show()
+        return None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self._display.close()
+
+    def _tops(self) -> list[int]:
+        """Index of the top disc of each peg, 0 the smallest; ``n_discs`` for an empty peg."""
+        n_discs = len(self.discs)
+        tops = [n_discs] * N_PEGS
+        for disc in reversed(range(n_discs)):
+            tops[self.discs[disc]] = disc
+        return tops
+
+    def _observe(self) -> NDArray[np.float32]:
+        tops, n_discs = self._tops(), len(self.discs)
+        observation = np.empty((N_PEGS, 3), dtype=np.float32)
+        for peg, top in enumerate(tops):
+            empty = top == n_discs
+            continues = peg in (self.variation["source"], self.variation["target"])
+            shade = top + (empty and not continues)
+            observation[peg] = (sum((top > other) - (top < other) for other in tops) / 2, 2 * (shade % 2) - 1, empty)
+        return observation.reshape(-1)
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self._display.show(self._frame())
+
+    def _frame(self) -> NDArray[np.uint8]:
+        return hanoi_frame(self.discs, self.variation["source"], self.variation["target"])
+
+    def _text(self) -> str:
+        n_discs = len(self.discs)
+        width = 2 * n_discs + 1
+        stacks = [[disc for disc in range(n_discs) if self.discs[disc] == peg] for peg in range(N_PEGS)]
+        rows = []
+        for level in reversed(range(n_discs)):
+            cells = []
+            for stack in stacks:
+                disc = stack[len(stack) - 1 - level] if level < len(stack) else None
+                cells.append(("|" if disc is None else "=" * (2 * disc + 3)).center(width))
+            rows.append(" ".join(cells).rstrip())
+        names = {self.variation["source"]: "source", self.variation["target"]: "target"}
+        base = " ".join(f"{peg} {names.get(peg, '')}".strip().center(width, "-") for peg in range(N_PEGS))
+        return "\n".join([*rows, base]) + "\n"
+
+
+class HanoiVectorEnv(PlanningVectorEnv):
+    """N towers stepped at once, equal to N :class:`HanoiEnv` step for step.
+
+    The discs of a peg are the bits of an integer, so that the top disc is the lowest bit set.
+
+    :param num_envs: number of environments
+    :param n_discs: see :class:`HanoiEnv`
+    :param source: see :class:`HanoiEnv`
+    :param target: see :class:`HanoiEnv`
+    :param max_episode_steps: steps after which an episode is truncated; ``None`` for no limit
+    """
+
+    variations: ClassVar[VariationSpace] = VARIATIONS
+    check_variation = staticmethod(check_variation)
+    observation_names: ClassVar[tuple[str, ...]] = OBSERVATION_NAMES
+    action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
+
+    _FROM, _TO = (np.array(column) for column in zip(*MOVES, strict=True))
+    # Lowest bit set of every set of discs; an empty peg reads MAX_DISCS, larger than any disc.
+    _TOP = np.array([(bits & -bits).bit_length() - 1 if bits else MAX_DISCS for bits in range(2**MAX_DISCS)])
+    _SHADE = np.float32([2 * (top % 2) - 1 for top in range(MAX_DISCS)] + [0])
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        n_discs: int = 3,
+        source: int = 0,
+        target: int = 2,
+        max_episode_steps: int | None = None,
+    ) -> None:
+        variation = self.variations.update({}, {"n_discs": n_discs, "source": source, "target": target})
+        super().__init__(
+            num_envs, _OBSERVATION_SPACE, spaces.Discrete(len(MOVES)), check_variation(variation), max_episode_steps
+        )
+        self._bits = np.zeros((num_envs, N_PEGS), dtype=np.int64)
+        self._tops = np.zeros((num_envs, N_PEGS), dtype=np.int64)
+        self._full = np.zeros(num_envs, dtype=np.int64)
+        self._source = np.zeros(num_envs, dtype=np.int64)
+        self._target = np.zeros(num_envs, dtype=np.int64)
+        self._base_shade = np.zeros((num_envs, N_PEGS), dtype=np.float32)
+        self._read_variations()
+
+    def _set_variations(self, options: Any) -> None:
+        super()._set_variations(options)
+        self._read_variations()
+
+    def _read_variations(self) -> None:
+        n_discs, self._source, self._target = (
+            np.array([variation[name] for variation in self.row_variations]) for name in self.variations
+        )
+        self._full = (1 << n_discs) - 1
+        pegs = np.arange(N_PEGS)
+        continues = (pegs == self._source[:, None]) | (pegs == self._target[:, None])
+        self._base_shade = (2 * ((n_discs[:, None] + ~continues) % 2) - 1).astype(np.float32)
+
+    def _reset_rows(self, rows: NDArray[np.intp]) -> None:
+        self._bits[rows] = 0
+        self._bits[rows, self._source[rows]] = self._full[rows]
+        self._tops[rows] = self._TOP[self._bits[rows]]
+
+    def _apply(self, actions: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        rows, source, target = self._rows, self._FROM[actions], self._TO[actions]
+        moved, under = self._tops[rows, source], self._tops[rows, target]
+        legal = moved < under
+        disc = np.where(legal, 1 << moved, 0)
+        left = self._bits[rows, source] ^ disc
+        grown = self._bits[rows, target] ^ disc
+        self._bits[rows, source] = left
+        self._bits[rows, target] = grown
+        self._tops[rows, source] = self._TOP[left]
+        self._tops[rows, target] = self._TOP[grown]
+        solved = self._bits[rows, self._target] == self._full
+        rewards = np.where(legal, STEP_REWARD, STEP_REWARD + ILLEGAL_REWARD) + GOAL_REWARD * solved
+        return rewards, solved
+
+    def _observe(self) -> NDArray[np.float32]:
+        tops = self._tops
+        observations = np.empty((self.num_envs, N_PEGS, 3), dtype=np.float32)
+        empty = tops == MAX_DISCS
+        for peg in range(N_PEGS):
+            larger, smaller = tops[:, peg, None] > tops, tops[:, peg, None] < tops
+            observations[:, peg, 0] = (larger.sum(1) - smaller.sum(1)) / 2
+        observations[:, :, 1] = np.where(empty, self._base_shade, self._SHADE[tops])
+        observations[:, :, 2] = empty
+        return observations.reshape(self.num_envs, -1)
+
+    def _optimal_steps(self) -> NDArray[np.int64]:
+        return self._full.copy()

@@ -1,0 +1,1 @@
+"""Planners: for every domain, how few steps its tasks need."""

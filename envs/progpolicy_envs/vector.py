@@ -1,0 +1,154 @@
+"""The batched form shared by the planning domains: NumPy arrays over N environments, no Python loop over them."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium.spaces import Space
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from progpolicy_envs.variation import Variation, VariationSpace
+
+
+class PlanningVectorEnv(VectorEnv, ABC):
+    """N environments stepped by array operations, reset within the step in which their episode ends.
+
+    A subclass keeps its state in arrays whose first axis is the environment and implements :meth:`_reset_rows`,
+    :meth:`_apply` and :meth:`_observe`.
+
+    Autoreset is ``SAME_STEP``: where an episode ends, the returned observation opens the next one and
+    ``infos["final_obs"][i]`` holds the last observation of the ended one, ``infos["is_success"][i]`` whether it
+    reached the goal. A variation is one value for all environments or a sequence of ``num_envs`` values.
+
+    :param num_envs: number of environments
+    :param observation_space: of one environment
+    :param action_space: of one environment (``Discrete``)
+    :param variation: the variation in force in every environment
+    :param max_episode_steps: steps after which an episode is truncated; ``None`` for no limit
+    """
+
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
+    variations: ClassVar[VariationSpace]
+
+    def __init__(
+        self,
+        num_envs: int,
+        observation_space: Space[Any],
+        action_space: Space[Any],
+        variation: Variation,
+        max_episode_steps: int | None,
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs={num_envs} is not accepted; it is at least 1")
+        self.num_envs = num_envs
+        self.single_observation_space = observation_space
+        self.single_action_space = action_space
+        self.observation_space = batch_space(observation_space, num_envs)
+        self.action_space = batch_space(action_space, num_envs)
+        self.max_episode_steps = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
+        self.row_variations: list[Variation] = [dict(variation) for _ in range(num_envs)]
+        self._elapsed = np.zeros(num_envs, dtype=np.int64)
+        self._rows = np.arange(num_envs)
+        self._generators: list[np.random.Generator] = [np.random.default_rng() for _ in range(num_envs)]
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start a new episode in every environment.
+
+        :param seed: environment ``i`` gets ``seed + i``, or ``seed[i]`` of a sequence; ``None`` keeps its generator
+        :param options: new variation values by name, each one value or a sequence of ``num_envs`` values
+        :return: observations ``(num_envs, *observation)`` and infos of arrays with ``num_envs`` entries
+        :raises ValueError: if a variation is not accepted
+        """
+        self._seed_rows(seed)
+        if options:
+            self._set_variations(options)
+        self._elapsed[:] = 0
+        self._reset_rows(self._rows)
+        infos = {
+            "variation": np.array([dict(variation) for variation in self.row_variations], dtype=object),
+            "optimal_steps": self._optimal_steps(),
+            "is_success": np.zeros(self.num_envs, dtype=bool),
+        }
+        return self._observe(), infos
+
+    def step(
+        self, actions: NDArray[np.integer]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """Apply one action in every environment.
+
+        :param actions: ``(num_envs,)`` integers, each in the single action space
+        :return: observations, rewards, terminated, truncated, infos
+        :raises ValueError: if ``actions`` has the wrong shape or holds an action out of range
+        """
+        actions = np.asarray(actions)
+        n_actions = self.single_action_space.n  # type: ignore[attr-defined]
+        if actions.shape != (self.num_envs,) or actions.min() < 0 or actions.max() >= n_actions:
+            raise ValueError(
+                f"actions of shape {actions.shape} and values {actions!r} are not accepted; "
+                f"needed: shape ({self.num_envs},), integers from 0 to {n_actions - 1}"
+            )
+        rewards, terminated = self._apply(actions)
+        self._elapsed += 1
+        truncated = (self._elapsed >= self.max_episode_steps) & ~terminated
+        observations = self._observe()
+        infos: dict[str, Any] = {"is_success": terminated}
+        ended = np.flatnonzero(terminated | truncated)
+        if len(ended):
+            infos["final_obs"] = np.full(self.num_envs, None, dtype=object)
+            for row in ended:
+                infos["final_obs"][row] = observations[row].copy()
+            self._elapsed[ended] = 0
+            self._reset_rows(ended)
+            observations = self._observe()
+        return observations, rewards, terminated, truncated, infos
+
+    @abstractmethod
+    def _reset_rows(self, rows: NDArray[np.intp]) -> None:
+        """Put the given environments into a starting state of their variation."""
+
+    @abstractmethod
+    def _apply(self, actions: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Change the state by one action each; return rewards and whether the goal is reached."""
+
+    @abstractmethod
+    def _observe(self) -> NDArray[np.float32]:
+        """Return the observations ``(num_envs, *observation)`` in an array of their own."""
+
+    @abstractmethod
+    def _optimal_steps(self) -> NDArray[np.int64]:
+        """Return the planner's number of steps from each environment's present state."""
+
+    def _seed_rows(self, seed: int | Sequence[int | None] | None) -> None:
+        if seed is None:
+            return
+        seeds = [seed + row for row in range(self.num_envs)] if isinstance(seed, int) else list(seed)
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"{len(seeds)} seeds given for {self.num_envs} environments")
+        for row, row_seed in enumerate(seeds):
+            if row_seed is not None:
+                self._generators[row] = np.random.Generator(np.random.PCG64(np.random.SeedSequence(row_seed)))
+
+    def _set_variations(self, options: Mapping[str, Any]) -> None:
+        per_row = [dict[str, Any]() for _ in range(self.num_envs)]
+        for name, value in options.items():
+            values = [value] * self.num_envs if np.ndim(value) == 0 else list(value)
+            if len(values) != self.num_envs:
+                raise ValueError(f"{name}: {len(values)} values given for {self.num_envs} environments")
+            for row, row_value in enumerate(values):
+                per_row[row][name] = row_value
+        self.row_variations = [
+            self.check_variation(self.variations.update(old, new))
+            for old, new in zip(self.row_variations, per_row, strict=True)
+        ]
+
+    @staticmethod
+    def check_variation(variation: Variation) -> Variation:
+        """Return ``variation``; a subclass raises ``ValueError`` where its values do not fit together."""
+        return variation
