@@ -38,6 +38,12 @@ DOMAINS: dict[str, Domain] = {
             ),
             unseen=tuple({"n_discs": n_discs} for n_discs in (5, 6, 7, 8)),
         ),
+        Domain(
+            id="Hiking-v0",
+            size="n_stars",
+            train=tuple({"n_stars": n_stars} for n_stars in (1, 2, 3, 4)),
+            unseen=tuple({"n_stars": n_stars} for n_stars in (5, 6, 7, 8, 9, 10)),
+        ),
     )
 }
 

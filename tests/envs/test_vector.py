@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
+from progpolicy_envs.layouts import LAYOUTS
+
 Draw = Callable[[np.random.Generator, int], dict[str, Any]]
 
 
@@ -16,8 +18,16 @@ def draw_hanoi(generator: np.random.Generator, num_envs: int) -> dict[str, Any]:
     return {"n_discs": generator.integers(1, 13, num_envs), "source": pegs[:, 0], "target": pegs[:, 1]}
 
 
+def draw_hiking(generator: np.random.Generator, num_envs: int) -> dict[str, Any]:
+    layouts = [*LAYOUTS, "random"]
+    # Up to 7 stars only: the planner's table doubles with each, and its own tests go to 12.
+    return {"n_stars": generator.integers(1, 8, num_envs), "layout": list(generator.choice(layouts, num_envs))}
+
+
 CASES: list[tuple[str, dict[str, Any], Draw]] = [
     ("Hanoi-v0", {}, draw_hanoi),
+    ("Hiking-v0", {"observation": "map"}, draw_hiking),
+    ("Hiking-v0", {"observation": "egocentric"}, draw_hiking),
 ]
 NUM_ENVS, LIMIT, STEPS = 64, 37, 90
 
