@@ -12,6 +12,7 @@ MAX_EPISODE_STEPS = 500
 _ENTRY_POINTS = {
     "Hanoi-v0": ("progpolicy_envs.hanoi:HanoiEnv", "progpolicy_envs.hanoi:HanoiVectorEnv"),
     "Hiking-v0": ("progpolicy_envs.hiking:HikingEnv", "progpolicy_envs.hiking:HikingVectorEnv"),
+    "Stacking-v0": ("progpolicy_envs.stacking:StackingEnv", "progpolicy_envs.stacking:StackingVectorEnv"),
 }
 
 

@@ -44,6 +44,12 @@ DOMAINS: dict[str, Domain] = {
             train=tuple({"n_stars": n_stars} for n_stars in (1, 2, 3, 4)),
             unseen=tuple({"n_stars": n_stars} for n_stars in (5, 6, 7, 8, 9, 10)),
         ),
+        Domain(
+            id="Stacking-v0",
+            size="n_plates",
+            train=tuple({"n_plates": n_plates} for n_plates in (1, 2, 3, 4)),
+            unseen=tuple({"n_plates": n_plates} for n_plates in (5, 6, 7, 8)),
+        ),
     )
 }
 

@@ -170,3 +170,68 @@ def _draw_hiker(draw: Any, left: float, top: float, size: float) -> None:
     draw.line(at((0.55, 0.42), (0.78, 0.5)), fill=JACKET, width=stroke)
     draw.ellipse(at((0.38, 0.08), (0.62, 0.32)), fill=SKIN)
     draw.pieslice(at((0.36, 0.04), (0.64, 0.32)), 180, 360, fill=INK)
+
+
+TABLE, TABLE_LINE, STEEL = (222, 196, 160), (190, 160, 122), (70, 76, 88)
+PLATES = (
+    (178, 34, 52),
+    (226, 112, 38),
+    (240, 186, 40),
+    (106, 168, 60),
+    (40, 150, 140),
+    (48, 116, 190),
+    (98, 78, 170),
+    (160, 70, 140),
+)
+
+
+def stacking_frame(n_side: int, plates: Sequence[Place], n_plates: int, gripper: Place) -> Frame:
+    """Draw the table from above with its plates and the gripper, and the stack from the side.
+
+    :param n_side: cells along a side of the table
+    :param plates: rows and columns of the plates on the table, the largest first
+    :param n_plates: how many plates there were; the others are on the stack
+    :param gripper: row and column
+    :return: ``(352, 480, 3)`` bytes
+    """
+    from PIL import Image, ImageDraw
+
+    width, height, cell, edge = 480, 352, 60, 14
+    image = Image.new("RGB", (width * SCALE, height * SCALE), PAPER)
+    draw = ImageDraw.Draw(image)
+
+    def at(*points: tuple[float, float]) -> list[tuple[float, float]]:
+        return [(x * SCALE, y * SCALE) for x, y in points]
+
+    def label(x: float, y: float, text: str, fill: tuple[int, int, int], size: int) -> None:
+        draw.text((x * SCALE, y * SCALE), text, fill=fill, anchor="mm", font_size=size * SCALE)
+
+    side = n_side * cell
+    draw.rounded_rectangle(at((edge - 6, edge - 6), (edge + side + 6, edge + side + 6)), 8 * SCALE, fill=WOOD)
+    draw.rectangle(at((edge, edge), (edge + side, edge + side)), fill=TABLE)
+    for line in range(n_side + 1):
+        draw.line(at((edge + line * cell, edge), (edge + line * cell, edge + side)), fill=TABLE_LINE, width=SCALE)
+        draw.line(at((edge, edge + line * cell), (edge + side, edge + line * cell)), fill=TABLE_LINE, width=SCALE)
+    for rank, (row, column) in enumerate(plates):
+        size = len(plates) - rank
+        x, y, radius = edge + (column + 0.5) * cell, edge + (row + 0.5) * cell, 9 + 19 * size / n_plates
+        colour = PLATES[n_plates - size]
+        draw.ellipse(at((x - radius, y - radius), (x + radius, y + radius)), fill=colour)
+        draw.ellipse(
+            at((x - 0.7 * radius, y - 0.7 * radius), (x + 0.7 * radius, y + 0.7 * radius)), outline=PAPER, width=SCALE
+        )
+        label(x, y, str(size), PAPER, 13)
+    x, y = edge + (gripper[1] + 0.5) * cell, edge + (gripper[0] + 0.5) * cell
+    for sign in (-1, 1):
+        draw.line(at((x + sign * 20, y - 27), (x + sign * 27, y - 27), (x + sign * 27, y + 27)), fill=STEEL, width=9)
+        draw.line(at((x + sign * 27, y + 27), (x + sign * 20, y + 27)), fill=STEEL, width=9)
+    label(edge + side / 2, height - 16, "table and gripper", INK, 14)
+    middle, level = 400, edge + side
+    draw.rounded_rectangle(at((middle - 64, level - 2), (middle + 64, level + 6)), 3 * SCALE, fill=WOOD)
+    for slot in range(n_plates - len(plates)):
+        half = 14 + 44 * (n_plates - slot) / n_plates
+        top = level - 26 * (slot + 1) - 2
+        draw.rounded_rectangle(at((middle - half, top), (middle + half, top + 24)), 7 * SCALE, fill=PLATES[slot])
+        label(middle, top + 12, str(n_plates - slot), PAPER, 13)
+    label(middle, height - 16, "stack", INK, 14)
+    return np.asarray(image.resize((width, height), Image.Resampling.LANCZOS))

@@ -8,6 +8,7 @@ from progpolicy_envs import DOMAINS, MAX_EPISODE_STEPS, get_domain
 SIZES = {
     "Hanoi-v0": ({1, 2, 3, 4}, {5, 6, 7, 8}),
     "Hiking-v0": ({1, 2, 3, 4}, {5, 6, 7, 8, 9, 10}),
+    "Stacking-v0": ({1, 2, 3, 4}, {5, 6, 7, 8}),
 }
 
 

@@ -24,10 +24,15 @@ def draw_hiking(generator: np.random.Generator, num_envs: int) -> dict[str, Any]
     return {"n_stars": generator.integers(1, 8, num_envs), "layout": list(generator.choice(layouts, num_envs))}
 
 
+def draw_stacking(generator: np.random.Generator, num_envs: int) -> dict[str, Any]:
+    return {"n_plates": generator.integers(1, 9, num_envs)}
+
+
 CASES: list[tuple[str, dict[str, Any], Draw]] = [
     ("Hanoi-v0", {}, draw_hanoi),
     ("Hiking-v0", {"observation": "map"}, draw_hiking),
     ("Hiking-v0", {"observation": "egocentric"}, draw_hiking),
+    ("Stacking-v0", {}, draw_stacking),
 ]
 NUM_ENVS, LIMIT, STEPS = 64, 37, 90
 
