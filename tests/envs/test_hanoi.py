@@ -1,8 +1,5 @@
 """Hanoi-v0, held against the puzzle's rules rather than against its own code."""
 
-import os
-import subprocess
-import sys
 from collections import deque
 from itertools import pairwise, permutations, product
 from pathlib import Path
@@ -16,7 +13,13 @@ from hypothesis import strategies as st
 import progpolicy_envs
 from progpolicy_envs.hanoi import ACTION_NAMES, MOVES, OBSERVATION_NAMES, HanoiEnv
 from progpolicy_envs.planners import hanoi as planner
-from tests.envs.helpers import assert_checkers_are_silent, assert_long_run_stays_sound, assert_picture_shows_the_state
+from tests.envs.helpers import (
+    assert_checkers_are_silent,
+    assert_long_run_stays_sound,
+    assert_picture_shows_the_state,
+    assert_window_opens_shows_and_closes,
+    run_python,
+)
 from tests.handwritten.evaluate import CrispPolicy, play, size_of
 from tests.handwritten.hanoi import hanoi_program
 
@@ -164,15 +167,8 @@ def test_picture_shows_the_state() -> None:
     assert_picture_shows_the_state(gym.make("Hanoi-v0", render_mode="rgb_array"), action=0)
 
 
-def test_window_opens_shows_and_closes(tmp_path: Path) -> None:
-    code = (
-        "import gymnasium as gym, progpolicy_envs, pygame\n"
-        "env = gym.make('Hanoi-v0', render_mode='human'); env.reset(); env.step(0)\n"
-        "assert pygame.display.get_init(); env.close(); assert not pygame.display.get_init()\n"
-    )
-    pytest.importorskip("pygame")
-    environment = {**os.environ, "SDL_VIDEODRIVER": "dummy", "PYTHONPATH": os.pathsep.join(sys.path)}
-    subprocess.run([sys.executable, "-c", code], check=True, env=environment, timeout=60)
+def test_window_opens_shows_and_closes() -> None:
+    assert_window_opens_shows_and_closes("Hanoi-v0")
 
 
 @pytest.mark.parametrize("n_discs", [1, 12])
@@ -187,8 +183,7 @@ def test_long_run_of_random_actions() -> None:
 
 def test_registration_does_not_import_the_environment() -> None:
     code = "import progpolicy_envs, sys; assert not {'progpolicy_envs.hanoi', 'pybullet', 'torch'} & set(sys.modules)"
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    subprocess.run([sys.executable, "-c", code], check=True, env=environment, timeout=60)
+    run_python(code)
     assert "Hanoi-v0" in progpolicy_envs.DOMAINS
 
 

@@ -12,7 +12,12 @@ from hypothesis import strategies as st
 from progpolicy_envs.hiking import ACTION_NAMES, STAR, HikingEnv
 from progpolicy_envs.layouts import LAYOUTS, N_RANDOM_LAYOUTS, NEIGHBOURS, Layout, random_layout
 from progpolicy_envs.planners import hiking as planner
-from tests.envs.helpers import assert_checkers_are_silent, assert_long_run_stays_sound, assert_picture_shows_the_state
+from tests.envs.helpers import (
+    assert_checkers_are_silent,
+    assert_long_run_stays_sound,
+    assert_picture_shows_the_state,
+    assert_window_opens_shows_and_closes,
+)
 from tests.handwritten.evaluate import play, size_of
 from tests.handwritten.hiking import egocentric_program, map_program, turns
 
@@ -278,6 +283,10 @@ def test_text_shows_hiker_stars_rocks_and_water() -> None:
 
 def test_picture_shows_the_state() -> None:
     assert_picture_shows_the_state(gym.make("Hiking-v0", render_mode="rgb_array"), action=EAST)
+
+
+def test_window_opens_shows_and_closes() -> None:
+    assert_window_opens_shows_and_closes("Hiking-v0")
 
 
 @pytest.mark.parametrize(("n_stars", "layout"), [(1, "valley"), (12, "random"), (12, "spiral")])

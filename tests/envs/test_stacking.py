@@ -10,7 +10,12 @@ from hypothesis import strategies as st
 
 from progpolicy_envs.planners import stacking as planner
 from progpolicy_envs.stacking import ACTION_NAMES, OBSERVATION_NAMES, StackingEnv
-from tests.envs.helpers import assert_checkers_are_silent, assert_long_run_stays_sound, assert_picture_shows_the_state
+from tests.envs.helpers import (
+    assert_checkers_are_silent,
+    assert_long_run_stays_sound,
+    assert_picture_shows_the_state,
+    assert_window_opens_shows_and_closes,
+)
 from tests.handwritten.evaluate import play, size_of
 from tests.handwritten.stacking import stacking_program
 
@@ -181,6 +186,10 @@ def test_picture_shows_the_state() -> None:
     env.reset(seed=0)
     row = env.unwrapped.gripper[0]  # type: ignore[attr-defined]
     assert_picture_shows_the_state(env, action=SOUTH if row < 4 else NORTH)
+
+
+def test_window_opens_shows_and_closes() -> None:
+    assert_window_opens_shows_and_closes("Stacking-v0")
 
 
 @pytest.mark.parametrize("n_plates", [1, 8])
