@@ -17,6 +17,7 @@ from tests.envs.helpers import (
     assert_checkers_are_silent,
     assert_long_run_stays_sound,
     assert_picture_shows_the_state,
+    assert_resets_hold_no_memory,
     assert_window_opens_shows_and_closes,
     run_python,
 )
@@ -165,6 +166,10 @@ def test_text_shows_discs_source_and_target() -> None:
 
 def test_picture_shows_the_state() -> None:
     assert_picture_shows_the_state(gym.make("Hanoi-v0", render_mode="rgb_array"), action=0)
+
+
+def test_a_thousand_resets_hold_no_memory() -> None:
+    assert_resets_hold_no_memory("Hanoi-v0", n_discs=12)
 
 
 def test_window_opens_shows_and_closes() -> None:

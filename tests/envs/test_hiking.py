@@ -12,13 +12,15 @@ from hypothesis import strategies as st
 from progpolicy_envs.hiking import ACTION_NAMES, STAR, HikingEnv
 from progpolicy_envs.layouts import LAYOUTS, N_RANDOM_LAYOUTS, NEIGHBOURS, Layout, random_layout
 from progpolicy_envs.planners import hiking as planner
+from sb3_progpolicy.programs.syntax import Program
 from tests.envs.helpers import (
     assert_checkers_are_silent,
     assert_long_run_stays_sound,
     assert_picture_shows_the_state,
+    assert_resets_hold_no_memory,
     assert_window_opens_shows_and_closes,
 )
-from tests.handwritten.evaluate import play, size_of
+from tests.handwritten.evaluate import CrispPolicy, play, size_of
 from tests.handwritten.hiking import egocentric_program, map_program, turns
 
 NORTH, EAST, SOUTH, WEST = range(4)
@@ -220,6 +222,18 @@ def test_handwritten_map_program_solves_training_and_unseen_variations(n_stars: 
     assert all(episode.optimal <= episode.steps <= round_trip for episode in episodes)
 
 
+@pytest.mark.parametrize(
+    ("observation", "layout", "program"),
+    [("egocentric", "random", egocentric_program()), ("map", "valley", map_program("valley"))],
+)
+def test_handwritten_programs_go_on_when_their_history_survives_episodes(
+    observation: str, layout: str, program: Program
+) -> None:
+    policy = CrispPolicy(program)
+    env = gym.make("Hiking-v0", observation=observation, layout=layout)
+    assert all(play(policy, env, seed=seed, n_stars=1 + seed % 10).success for seed in range(30))
+
+
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_stars_never_outweigh_the_hiker_in_the_map_program(layout: str) -> None:
     for heading in range(4):
@@ -283,6 +297,10 @@ def test_text_shows_hiker_stars_rocks_and_water() -> None:
 
 def test_picture_shows_the_state() -> None:
     assert_picture_shows_the_state(gym.make("Hiking-v0", render_mode="rgb_array"), action=EAST)
+
+
+def test_a_thousand_resets_hold_no_memory() -> None:
+    assert_resets_hold_no_memory("Hiking-v0", n_stars=6, layout="lakeside", observation="egocentric")
 
 
 def test_window_opens_shows_and_closes() -> None:

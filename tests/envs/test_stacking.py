@@ -14,9 +14,10 @@ from tests.envs.helpers import (
     assert_checkers_are_silent,
     assert_long_run_stays_sound,
     assert_picture_shows_the_state,
+    assert_resets_hold_no_memory,
     assert_window_opens_shows_and_closes,
 )
-from tests.handwritten.evaluate import play, size_of
+from tests.handwritten.evaluate import CrispPolicy, play, size_of
 from tests.handwritten.stacking import stacking_program
 
 NORTH, EAST, SOUTH, WEST, PICK = range(5)
@@ -134,6 +135,12 @@ def test_handwritten_program_is_optimal_on_training_and_unseen_variations(n_plat
     assert [episode.steps for episode in episodes] == [episode.optimal for episode in episodes]
 
 
+def test_handwritten_program_stays_optimal_when_its_history_survives_episodes() -> None:
+    policy, env = CrispPolicy(stacking_program()), gym.make("Stacking-v0")
+    episodes = [play(policy, env, seed=seed, n_plates=1 + seed % 8) for seed in range(16)]
+    assert [episode.steps for episode in episodes] == [episode.optimal for episode in episodes]
+
+
 def test_only_the_largest_plate_can_be_picked_up() -> None:
     env = StackingEnv(n_plates=2)
     env.reset(seed=0)
@@ -186,6 +193,10 @@ def test_picture_shows_the_state() -> None:
     env.reset(seed=0)
     row = env.unwrapped.gripper[0]  # type: ignore[attr-defined]
     assert_picture_shows_the_state(env, action=SOUTH if row < 4 else NORTH)
+
+
+def test_a_thousand_resets_hold_no_memory() -> None:
+    assert_resets_hold_no_memory("Stacking-v0", n_plates=8)
 
 
 def test_window_opens_shows_and_closes() -> None:
