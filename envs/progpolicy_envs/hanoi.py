@@ -27,7 +27,7 @@ STEP_REWARD, ILLEGAL_REWARD, GOAL_REWARD = -0.01, -0.05, 1.0
 OBSERVATION_NAMES = tuple(f"{feature}[{peg}]" for peg in range(N_PEGS) for feature in ("rank", "colour", "empty"))
 ACTION_NAMES = tuple(f"move {source}->{target}" for source, target in MOVES)
 _OBSERVATION_SPACE = spaces.Box(
-    np.tile(np.float32([-1, -1, 0]), N_PEGS), np.tile(np.float32([1, 1, 1]), N_PEGS), dtype=np.float32
+    np.tile([-1.0, -1.0, 0.0], N_PEGS), np.tile([1.0, 1.0, 1.0], N_PEGS), shape=(3 * N_PEGS,), dtype=np.float32
 )
 
 
@@ -236,7 +236,7 @@ class HanoiVectorEnv(PlanningVectorEnv):
     _FROM, _TO = (np.array(column) for column in zip(*MOVES, strict=True))
     # Lowest bit set of every set of discs; an empty peg reads MAX_DISCS, larger than any disc.
     _TOP = np.array([(bits & -bits).bit_length() - 1 if bits else MAX_DISCS for bits in range(2**MAX_DISCS)])
-    _SHADE = np.float32([2 * (top % 2) - 1 for top in range(MAX_DISCS)] + [0])
+    _SHADE = np.array([2 * (top % 2) - 1 for top in range(MAX_DISCS)] + [0], dtype=np.float32)
 
     def __init__(
         self,

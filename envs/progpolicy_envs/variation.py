@@ -31,7 +31,7 @@ class IntParameter:
         :param value: any integral number (NumPy integers included, booleans not)
         :raises ValueError: if it is of another type or out of range
         """
-        if isinstance(value, bool) or not isinstance(value, Integral) or not self.low <= value <= self.high:
+        if isinstance(value, bool) or not isinstance(value, Integral) or not self.low <= int(value) <= self.high:
             raise ValueError(f"{self.name}={value!r} is not accepted; {self.name} is {self.allowed}")
         return int(value)
 
