@@ -121,7 +121,7 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
         data = super()._get_constructor_parameters()
         data.update(
             self.program_kwargs,
-            net_arch=self.net_arch["vf"],
+            net_arch=cast(dict[str, list[int]], self.net_arch)["vf"],
             reset_state_at_episode_start=self.reset_state_at_episode_start,
         )
         # Arguments of SB3's constructor that a program has no use for.
@@ -173,7 +173,7 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
         parameters = self.module.mix(features, self.module.masses(tests))
         if isinstance(self.action_dist, DiagGaussianDistribution):
             return self.action_dist.proba_distribution(parameters, self.log_std)
-        return self.action_dist.proba_distribution(action_logits=parameters)  # type: ignore[call-arg]
+        return self.action_dist.proba_distribution(action_logits=parameters)
 
     def _values(self, features: th.Tensor) -> th.Tensor:
         return self.value_net(self.mlp_extractor.forward_critic(features))
@@ -185,7 +185,7 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
 
 
 class RecurrentProgrammaticPolicy(ProgrammaticActorCritic, RecurrentActorCriticPolicy):
-    """ "ProgPolicy": a program with recurrent conditions, for sb3-contrib's ``RecurrentPPO`` and for ``ReptilePPO``.
+    """The policy ``"ProgPolicy"``: a program with recurrent conditions, for ``RecurrentPPO`` and ``ReptilePPO``.
 
     The states of the conditions take the place of the LSTM states: two tensors ``(1, n_envs, hidden_size)``, the
     second used by LSTM conditions only. The critic has none.
@@ -257,7 +257,7 @@ class RecurrentProgrammaticPolicy(ProgrammaticActorCritic, RecurrentActorCriticP
 
 
 class ProgrammaticPolicy(ProgrammaticActorCritic):
-    """ "PRLPolicy": a program with affine conditions and no state, for SB3's ``PPO`` (PRL, Qiu and Zhu, 2022).
+    """The policy ``"PRLPolicy"``: a program with affine conditions, for SB3's ``PPO`` (PRL, Qiu and Zhu, 2022).
 
     See :class:`ProgrammaticActorCritic` for the arguments; ``cell`` is ``"affine"``.
     """
@@ -290,7 +290,9 @@ class ProgrammaticPolicy(ProgrammaticActorCritic):
         """Return the values ``(n, 1)``."""
         return self._values(self._split_features(obs)[1])
 
-    def evaluate_actions(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+    def evaluate_actions(  # type: ignore[override]
+        self, obs: th.Tensor, actions: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
         """Return values, log-probabilities and entropies. See ``ActorCriticPolicy.evaluate_actions``."""
         pi_features, vf_features = self._split_features(obs)
         distribution = self._distribution_of(pi_features)

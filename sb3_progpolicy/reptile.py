@@ -68,7 +68,7 @@ class ReptileWrapper(BaseCallback):
         self._inner_update = 0
         self._theta: list[th.Tensor] = []
         self._task = 0
-        self._entropy: int | None = None
+        self.rng = np.random.default_rng()
         self._successes: list[float] = []
         self._lengths: list[float] = []
 
@@ -117,18 +117,15 @@ class ReptileWrapper(BaseCallback):
         self._successes, self._lengths = [], []
 
     def _begin_task(self) -> None:
-        """Line 4: draw a task and start it afresh; all randomness of a meta-iteration follows from the seed and its number."""
+        """Line 4: draw a task and start it afresh; what is random in it follows from the seed and its number."""
         model = self.model
         env = model.get_env()
         assert env is not None
         if model.seed is not None:
             seeds = np.random.SeedSequence([model.seed, self.meta_iteration]).generate_state(2)
             model.set_random_seed(int(seeds[0] >> 1))
-            rng = np.random.default_rng(int(seeds[1]))
-        else:
-            self._entropy = self._entropy or np.random.SeedSequence().generate_state(1).item()
-            rng = np.random.default_rng([self._entropy, self.meta_iteration])
-        self._task, variation = self.tasks.sample(rng, 1 - model._current_progress_remaining)
+            self.rng = np.random.default_rng(int(seeds[1]))
+        self._task, variation = self.tasks.sample(self.rng, 1 - model._current_progress_remaining)
         self.tasks.put_in_force(env, variation)
         model._last_obs = env.reset()  # type: ignore[assignment]
         model._last_episode_starts = np.ones((env.num_envs,), dtype=bool)

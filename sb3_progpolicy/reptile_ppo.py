@@ -1,4 +1,4 @@
-"""ReptilePPO: algorithm 1 of the paper. PPO on whole rollouts inside Reptile, search for a program, then training of it."""
+"""ReptilePPO: algorithm 1 of the paper, PPO on whole rollouts inside Reptile, with search for a program."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import pathlib
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
 import torch as th
@@ -19,6 +19,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
@@ -31,6 +32,8 @@ from sb3_progpolicy.policies import (
     ProgrammaticPolicy,
     RecurrentProgrammaticPolicy,
 )
+from sb3_progpolicy.programs.modules import State
+from sb3_progpolicy.programs.sampler import ProgramSampler
 from sb3_progpolicy.programs.syntax import Program
 from sb3_progpolicy.reptile import MetaOptimizer, ReptileWrapper
 from sb3_progpolicy.tasks import TaskDistribution, default_tasks
@@ -57,8 +60,8 @@ class ReptilePPO(PPO):
       episode; they are zeroed at a task switch only (section 2.4);
     * recurrent policies train on whole rollouts, one unpadded sequence per environment;
     * while the search goes on, gradient steps alternate between W, with phi frozen, and phi, with W frozen (section
-      2.3). When ``search_fraction`` of the steps is over the most likely program is extracted (line 10) and phi alone is
-      trained on (lines 11-17).
+      2.3). When ``search_fraction`` of the steps is over the most likely program is extracted (line 10) and phi alone
+      is trained on (lines 11-17).
 
     :param policy: ``"ProgPolicy"``, ``"PRLPolicy"``, ``"MlpPolicy"``, ``"MlpLstmPolicy"`` or a policy class
     :param env: an environment id (the fastest vectorised form is built), an environment or a ``VecEnv``
@@ -275,16 +278,19 @@ class ReptilePPO(PPO):
         callback.on_rollout_start()
         if self.temperature is not None and isinstance(self.policy, ProgrammaticActorCritic):
             self.policy.set_temperature(FloatSchedule(self.temperature)(self._current_progress_remaining))
+        self._sampler = self._make_sampler()
         # States at which the sequences of the update start.
         self._sequence_states: list[RNNStates] = []
         for step in range(n_rollout_steps):
             if self.recurrent and step % self.sequence_length == 0:
                 assert self._last_lstm_states is not None
                 self._sequence_states.append(self._last_lstm_states)
-            actions, values, log_probs = self._act()
+            actions = self._act(rollout_buffer, step)
             env_actions = actions
             if isinstance(self.action_space, spaces.Box):
                 env_actions = np.clip(actions, self.action_space.low, self.action_space.high)
+            elif isinstance(self.action_space, spaces.Discrete) and self.action_space.start:
+                env_actions = actions + self.action_space.start
             new_obs, rewards, dones, infos = env.step(env_actions)
             self.num_timesteps += env.num_envs
             callback.update_locals(locals())
@@ -294,31 +300,64 @@ class ReptilePPO(PPO):
             if self.reward_scaler is not None:
                 rewards = self.reward_scaler(rewards, dones)
             self._bootstrap_truncated(rewards, dones, infos)
-            rollout_buffer.add(
-                self._last_obs,  # type: ignore[arg-type]
-                actions.reshape(env.num_envs, -1),
-                rewards,
-                self._last_episode_starts,  # type: ignore[arg-type]
-                values,
-                log_probs,
-            )
+            rollout_buffer.observations[step] = self._last_obs
+            rollout_buffer.actions[step] = actions.reshape(env.num_envs, -1)
+            rollout_buffer.rewards[step] = rewards
+            rollout_buffer.episode_starts[step] = self._last_episode_starts
             self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]
-        with th.no_grad():
-            last_values = self._predict_values(obs_as_tensor(self._last_obs, self.device))  # type: ignore[arg-type]
-        rollout_buffer.compute_returns_and_advantage(last_values=last_values, dones=dones)
+        rollout_buffer.pos, rollout_buffer.full = n_rollout_steps, True
+        self._complete_rollout(rollout_buffer, dones)
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
 
+    def _make_sampler(self) -> ProgramSampler | None:
+        """Return the fast way to draw actions, where there is one: a program on the CPU that reads flat numbers."""
+        policy = self.policy
+        if not isinstance(policy, ProgrammaticActorCritic) or self.device.type != "cpu":
+            return None
+        if type(policy.features_extractor) not in (FlattenExtractor, NormalizingExtractor):
+            return None
+        return ProgramSampler(policy.module, getattr(policy, "log_std", None))
+
     @th.no_grad()
-    def _act(self) -> tuple[np.ndarray, th.Tensor, th.Tensor]:
+    def _act(self, buffer: RolloutBuffer, step: int) -> np.ndarray:
+        """Draw actions ``(n_envs, *action_shape)`` and advance the recurrent states."""
         obs = obs_as_tensor(self._last_obs, self.device)  # type: ignore[arg-type]
+        if self._sampler is not None:
+            features = self.policy.features_extractor(obs).numpy()
+            hidden, cell = (state[0].numpy() for state in self._program_states())
+            actions, hidden, cell = self._sampler.sample(features, hidden, cell, self.reptile.rng)
+            if self.recurrent:
+                states = th.from_numpy(hidden)[None], th.from_numpy(cell)[None]
+                self._last_lstm_states = RNNStates(states, states)
+            return actions
         if self.recurrent:
             starts = th.zeros(self.n_envs, device=self.device)  # states survive the end of an episode
-            actions, values, log_probs, self._last_lstm_states = self.policy(obs, self._last_lstm_states, starts)
+            drawn, values, log_probs, self._last_lstm_states = self.policy(obs, self._last_lstm_states, starts)
         else:
-            actions, values, log_probs = self.policy(obs)
-        return actions.cpu().numpy(), values, log_probs
+            drawn, values, log_probs = self.policy(obs)
+        buffer.values[step] = values.cpu().numpy().ravel()
+        buffer.log_probs[step] = log_probs.cpu().numpy()
+        return drawn.cpu().numpy()
+
+    def _program_states(self) -> State:
+        assert isinstance(self.policy, ProgrammaticActorCritic)
+        if self._last_lstm_states is None:
+            return self.policy.module.initial_state(self.n_envs)
+        return cast(State, self._last_lstm_states.pi)
+
+    @th.no_grad()
+    def _complete_rollout(self, buffer: RolloutBuffer, dones: np.ndarray) -> None:
+        """Put in what the fast way leaves out, values and log-probabilities, and estimate the advantages."""
+        if self._sampler is not None:
+            rollout = self._sequences()
+            values, log_probs, _ = self._evaluate(rollout)
+            shape = (-1, self.n_envs, self.sequence_length)
+            for array, values_of in ((buffer.values, values), (buffer.log_probs, log_probs)):
+                array[:] = values_of.numpy().reshape(shape).swapaxes(1, 2).reshape(array.shape)
+        last_values = self._predict_values(obs_as_tensor(self._last_obs, self.device))  # type: ignore[arg-type]
+        buffer.compute_returns_and_advantage(last_values=last_values, dones=dones)
 
     def _predict_values(self, obs: th.Tensor, rows: Sequence[int] | slice = slice(None)) -> th.Tensor:
         if not self.recurrent:
@@ -362,9 +401,7 @@ class ReptilePPO(PPO):
         self._n_updates += self.n_epochs
         self._log(th.stack(statistics).mean(0).tolist(), clip_range)
         if isinstance(self.policy.features_extractor, NormalizingExtractor):
-            self.policy.features_extractor.update(
-                self.rollout_buffer.observations.reshape(-1, *self.observation_space.shape)
-            )  # type: ignore[misc]
+            self.policy.features_extractor.update(rollout["observations"].flatten(0, 1))
 
     def _freeze(self, derivation: bool | None) -> None:
         """Freeze W (``True``), phi (``False``) or nothing (``None``)."""
@@ -377,7 +414,7 @@ class ReptilePPO(PPO):
                 parameter.requires_grad_(not frozen)
 
     def _sequences(self) -> dict[str, th.Tensor]:
-        """Lay the buffer out as ``(n_sequences, sequence_length, ...)``; nothing resets inside, so nothing is padded."""
+        """Lay the buffer out as ``(n_sequences, sequence_length, ...)``; nothing resets inside: nothing is padded."""
         buffer, length = self.rollout_buffer, self.sequence_length
 
         def lay_out(array: np.ndarray) -> th.Tensor:
@@ -398,7 +435,7 @@ class ReptilePPO(PPO):
     def _minibatches(self, n_sequences: int) -> Iterator[np.ndarray]:
         per_batch = max(1, self.batch_size // self.sequence_length)
         for _ in range(self.n_epochs):
-            order = np.random.permutation(n_sequences)
+            order = self.reptile.rng.permutation(n_sequences)
             yield from (order[start : start + per_batch] for start in range(0, n_sequences, per_batch))
 
     def _evaluate(self, batch: Mapping[str, th.Tensor]) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
@@ -446,10 +483,8 @@ class ReptilePPO(PPO):
         names = ("policy_gradient_loss", "value_loss", "entropy_loss", "approx_kl", "clip_fraction", "loss")
         for name, value in zip(names, statistics, strict=True):
             self.logger.record(f"train/{name}", value)
-        buffer = self.rollout_buffer
-        self.logger.record(
-            "train/explained_variance", explained_variance(buffer.values.flatten(), buffer.returns.flatten())
-        )
+        values, returns = self.rollout_buffer.values.flatten(), self.rollout_buffer.returns.flatten()
+        self.logger.record("train/explained_variance", explained_variance(values, returns))
         if hasattr(self.policy, "log_std"):
             self.logger.record("train/std", self.policy.log_std.exp().mean().item())
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -489,7 +524,7 @@ class ReptilePPO(PPO):
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "reptile", "_last_lstm_states", "_sequence_states"]
+        return [*super()._excluded_save_params(), "reptile", "_last_lstm_states", "_sequence_states", "_sampler"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer", "reptile.meta_optimizer"], []

@@ -9,6 +9,7 @@ import torch as th
 from torch import nn
 
 from sb3_progpolicy.programs.grammar import derivations
+from sb3_progpolicy.programs.recurrence import scan
 from sb3_progpolicy.programs.search import DerivationSearch
 from sb3_progpolicy.programs.syntax import GATES, ActionSpec, Cell, Condition, Controller, Expression, IfThenElse
 
@@ -74,11 +75,19 @@ class Conditions(nn.Module):
             return self.affine(inputs), state
         if self.cell == "lstm":
             hidden, state = self.rnn(inputs, state)
+        elif inputs.device.type == "cpu" and inputs.dtype == th.float32:
+            hidden = self._scan(inputs, state[0][0])
+            state = (hidden[-1:], state[1])
         else:
             hidden, last = self.rnn(inputs, state[0])
             state = (last, state[1])
         units = hidden.unflatten(-1, (self.n_conditions, self.size))
         return (units * self.readout).sum(-1) + self.readout_bias, state
+
+    def _scan(self, inputs: th.Tensor, hidden: th.Tensor) -> th.Tensor:
+        names = ("weight_ih_l0", "bias_ih_l0", "weight_hh_l0", "bias_hh_l0")
+        input_weight, input_bias, weight, bias = (cast(th.Tensor, getattr(self.rnn, name)) for name in names)
+        return scan(self.cell, nn.functional.linear(inputs, input_weight, input_bias), weight, bias, hidden)
 
     def to_syntax(self, k: int) -> Condition:
         """Return condition ``k`` (0-based) as plain data."""
