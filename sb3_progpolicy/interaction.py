@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, is_vecenv_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_progpolicy.programs.syntax import ActionSpec
@@ -159,3 +159,28 @@ class VecInteractionHistory(VecEnvWrapper):
                     (info["terminal_observation"], self._actions[row], [rewards[row], ended]), dtype=np.float32
                 )
         return joined, rewards, dones, infos
+
+
+def program_names(venv: VecEnv) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return readable names of a program's inputs and outputs.
+
+    They come from the environment's ``observation_names`` and ``action_names``, where it has them.
+
+    :param venv: the environments a program is trained in
+    :return: one name per number of X, one per controller output
+    """
+    spec = action_spec(venv.action_space)
+    history = spec.history_size + 2 if is_vecenv_wrapped(venv, VecInteractionHistory) else 0
+    n_observations = int(np.prod(venv.observation_space.shape or (0,))) - history
+    observations, actions = (
+        tuple(venv.get_attr(attribute)[0]) if venv.has_attr(attribute) else ()
+        for attribute in ("observation_names", "action_names")
+    )
+    if len(observations) != n_observations:
+        observations = tuple(f"observation[{i}]" for i in range(n_observations))
+    if len(actions) != spec.n_outputs:
+        actions = tuple(f"action[{i}]" for i in range(spec.n_outputs))
+    if history:
+        remembered = (*(f"previous {name}" for name in actions), "previous reward", "previous done")
+        return (*observations, *remembered), actions
+    return observations, actions

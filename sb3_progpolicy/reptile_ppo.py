@@ -19,12 +19,13 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
 
-from sb3_progpolicy.interaction import VecInteractionHistory
+from sb3_progpolicy.interaction import VecInteractionHistory, program_names
 from sb3_progpolicy.normalization import NormalizingExtractor, RewardScaler
 from sb3_progpolicy.policies import (
     DERIVATION_LR_SCALE,
@@ -156,7 +157,9 @@ class ReptilePPO(PPO):
             raise ValueError(f"length_coef={length_coef} is not accepted; it is at least 0")
         self.env_id = env if isinstance(env, str) else _env_id(env)
         self.interaction_history = interaction_history
-        venv = None if env is None else self._prepare_env(env, n_envs, seed, env_kwargs or {})
+        venv = None
+        if env is not None:
+            venv = _with_history(_make_venv(env, n_envs, seed, env_kwargs or {}), interaction_history)
         if batch_size is None:
             batch_size = max(2, n_steps * (1 if venv is None else venv.num_envs) // 2)
         policy_kwargs = dict(policy_kwargs or {})
@@ -170,6 +173,10 @@ class ReptilePPO(PPO):
         self.search_fraction, self.length_coef, self.temperature = search_fraction, length_coef, temperature
         self.normalize_observations = normalize_observations
         self.reward_scaler = RewardScaler(gamma) if scale_rewards else None
+        self.input_names: tuple[str, ...] | None = None
+        self.output_names: tuple[str, ...] | None = None
+        if venv is not None:
+            self.input_names, self.output_names = program_names(venv)
         self.meta_iteration = 0
         self._last_lstm_states: RNNStates | None = None
         super().__init__(
@@ -198,19 +205,6 @@ class ReptilePPO(PPO):
         )
 
     # ------------------------------------------------------------------------------------------------ set-up
-
-    def _prepare_env(
-        self, env: GymEnv | str, n_envs: int | None, seed: int | None, env_kwargs: Mapping[str, Any]
-    ) -> VecEnv:
-        if isinstance(env, str):
-            venv = make_fast_vec_env(env, DEFAULT_N_ENVS if n_envs is None else n_envs, seed, **env_kwargs)
-        elif n_envs is not None or env_kwargs:
-            raise ValueError("n_envs and env_kwargs are for environment ids; the environment given is already made")
-        else:
-            venv = self._wrap_env(env)
-        if self.interaction_history and not is_vecenv_wrapped(venv, VecInteractionHistory):
-            venv = VecInteractionHistory(venv)
-        return venv
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -503,11 +497,15 @@ class ReptilePPO(PPO):
     def program(self, **metadata: Any) -> Program:
         """Return the most likely program as plain data, its inputs and outputs named by the environment.
 
-        :param metadata: JSON values to keep with it; the environment id, the seed and the steps are added
+        :param metadata: JSON values to keep with it; environment id, seed and number of steps are put in
+        :raises TypeError: if the policy is not a program
         """
         if not isinstance(self.policy, ProgrammaticActorCritic):
-            raise TypeError(f"{type(self.policy).__name__} is not a program; use ProgPolicy or PRLPolicy")
-        raise NotImplementedError
+            raise TypeError(f"{type(self.policy).__name__} is not a program; ProgPolicy and PRLPolicy are")
+        origin = {"env": self.env_id, "seed": self.seed, "timesteps": self.num_timesteps}
+        return self.policy.program(
+            self.input_names, self.output_names, self.interaction_history, **{**origin, **metadata}
+        )
 
     # ------------------------------------------------------------------------------------------ learn and save
 
@@ -522,6 +520,35 @@ class ReptilePPO(PPO):
     ) -> SelfReptilePPO:
         """Train. See SB3's ``BaseAlgorithm.learn``; ``reset_num_timesteps=False`` goes on where training stopped."""
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    @classmethod
+    def load(
+        cls: type[SelfReptilePPO],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | str | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfReptilePPO:
+        """Load a model. See SB3's ``BaseAlgorithm.load``.
+
+        :param env: an environment id is accepted too; what the policy sees of its interaction is appended as it was
+            in training
+        """
+        if env is not None:
+            data, _, _ = load_from_zip_file(path, device=device, custom_objects=custom_objects)
+            if isinstance(path, io.BufferedIOBase):
+                path.seek(0)
+            assert data is not None
+            n_envs = data["n_envs"] if isinstance(env, str) else None
+            env = _with_history(_make_venv(env, n_envs, data["seed"], {}), data["interaction_history"])
+        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """Set the environment, and append the interaction history to its observations if the policy reads it."""
+        super().set_env(_with_history(_make_venv(env, None, None, {}), self.interaction_history), force_reset)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "reptile", "_last_lstm_states", "_sequence_states", "_sampler"]
@@ -565,6 +592,20 @@ class _Reptile(ReptileWrapper):
         if model.reward_scaler is not None:
             model.reward_scaler.forget_returns()
         super()._begin_task()
+
+
+def _make_venv(env: GymEnv | str, n_envs: int | None, seed: int | None, env_kwargs: Mapping[str, Any]) -> VecEnv:
+    if isinstance(env, str):
+        return make_fast_vec_env(env, DEFAULT_N_ENVS if n_envs is None else n_envs, seed, **env_kwargs)
+    if n_envs is not None or env_kwargs:
+        raise ValueError("n_envs and env_kwargs are for environment ids; the environment given is already made")
+    return PPO._wrap_env(env)
+
+
+def _with_history(venv: VecEnv, interaction_history: bool) -> VecEnv:
+    if interaction_history and not is_vecenv_wrapped(venv, VecInteractionHistory):
+        return VecInteractionHistory(venv)
+    return venv
 
 
 def _env_id(env: Any) -> str | None:
