@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from typing import Literal
 
 import numpy as np
@@ -32,11 +33,14 @@ class ReptileWrapper(BaseCallback):
         tasks = TaskDistribution({"n_discs": [1, 2, 3, 4]})
         PPO("MlpPolicy", "Hanoi-v0").learn(100_000, callback=ReptileWrapper(tasks))
 
-    Logs ``reptile/meta_iteration``, ``reptile/meta_step_norm``, ``reptile/meta_learning_rate`` and, for the variation
-    of the current task, ``success/<variation>`` and ``steps/<variation>``.
+    Logs ``reptile/meta_iteration``, ``reptile/meta_step_norm``, ``reptile/meta_learning_rate`` and, for the variations
+    of the current tasks, ``success/<variation>`` and ``steps/<variation>``.
 
     :param tasks: what to train on
     :param inner_updates: k, rollouts (each followed by an update) per task, at least 1
+    :param tasks_per_iteration: tasks drawn for a meta-iteration and dealt out over the environments. 1 is algorithm 1 as
+        printed; with more, each inner update follows the mean gradient over several tasks, so that it cannot specialise
+        on one of them. At most one task per environment
     :param meta_learning_rate: beta, a number or a schedule of the remaining progress (1 to 0)
     :param meta_optimizer: ``"sgd"`` for the plain step, ``"adam"``
     :param meta_update: ``False`` leaves the meta-step out, so that training just goes on from task to task (PPO-N)
@@ -50,6 +54,7 @@ class ReptileWrapper(BaseCallback):
         self,
         tasks: TaskDistribution,
         inner_updates: int = 4,
+        tasks_per_iteration: int = 1,
         meta_learning_rate: float | Schedule = 1.0,
         meta_optimizer: MetaOptimizer = "sgd",
         meta_update: bool = True,
@@ -58,19 +63,22 @@ class ReptileWrapper(BaseCallback):
         super().__init__(verbose)
         if inner_updates < 1:
             raise ValueError(f"inner_updates={inner_updates} is not accepted; it is at least 1")
+        if tasks_per_iteration < 1:
+            raise ValueError(f"tasks_per_iteration={tasks_per_iteration} is not accepted; it is at least 1")
         if meta_optimizer not in _META_OPTIMIZERS:
             raise ValueError(f"meta_optimizer={meta_optimizer!r} is not accepted; known: {', '.join(_META_OPTIMIZERS)}")
         self.tasks, self.inner_updates, self.meta_update = tasks, inner_updates, meta_update
+        self.tasks_per_iteration = tasks_per_iteration
         self.meta_learning_rate = FloatSchedule(meta_learning_rate)
         self.meta_optimizer_class = _META_OPTIMIZERS[meta_optimizer]
         self.meta_optimizer: th.optim.Optimizer | None = None
         self.meta_iteration = 0
         self._inner_update = 0
         self._theta: list[th.Tensor] = []
-        self._task = 0
+        self._row_tasks: list[int] = []
         self.rng = np.random.default_rng()
-        self._successes: list[float] = []
-        self._lengths: list[float] = []
+        self._successes: dict[int, list[float]] = defaultdict(list)
+        self._lengths: dict[int, list[float]] = defaultdict(list)
 
     def set_up(self, model: OnPolicyAlgorithm) -> None:
         """Make the meta-optimizer for the parameters of ``model``, unless there is one."""
@@ -100,21 +108,21 @@ class ReptileWrapper(BaseCallback):
         if dones.any():
             infos = self.locals["infos"]
             for row in np.flatnonzero(dones):
+                task = self._row_tasks[row]
                 if "is_success" in infos[row]:
-                    self._successes.append(float(infos[row]["is_success"]))
+                    self._successes[task].append(float(infos[row]["is_success"]))
                 if "episode" in infos[row]:
-                    self._lengths.append(float(infos[row]["episode"]["l"]))
+                    self._lengths[task].append(float(infos[row]["episode"]["l"]))
         return True
 
     def _on_rollout_end(self) -> None:
-        label = self.tasks.label(self._task)
-        if self._successes:
-            success = float(np.mean(self._successes))
-            self.tasks.record(self._task, success)
-            self.logger.record(f"success/{label}", success)
-        if self._lengths:
-            self.logger.record(f"steps/{label}", float(np.mean(self._lengths)))
-        self._successes, self._lengths = [], []
+        for task, successes in self._successes.items():
+            self.tasks.record(task, float(np.mean(successes)))
+            self.logger.record(f"success/{self.tasks.label(task)}", float(np.mean(successes)))
+        for task, lengths in self._lengths.items():
+            self.logger.record(f"steps/{self.tasks.label(task)}", float(np.mean(lengths)))
+        self._successes.clear()
+        self._lengths.clear()
 
     def _begin_task(self) -> None:
         """Line 4: draw a task and start it afresh; what is random in it follows from the seed and its number."""
@@ -125,8 +133,11 @@ class ReptileWrapper(BaseCallback):
             seeds = np.random.SeedSequence([model.seed, self.meta_iteration]).generate_state(2)
             model.set_random_seed(int(seeds[0] >> 1))
             self.rng = np.random.default_rng(int(seeds[1]))
-        self._task, variation = self.tasks.sample(self.rng, 1 - model._current_progress_remaining)
-        self.tasks.put_in_force(env, variation)
+        n_tasks = min(self.tasks_per_iteration, env.num_envs)
+        tasks = self.tasks.sample(self.rng, 1 - model._current_progress_remaining, n_tasks)
+        dealt = [tasks[row % n_tasks] for row in range(env.num_envs)]
+        self._row_tasks = [index for index, _ in dealt]
+        self.tasks.put_in_force(env, [variation for _, variation in dealt])
         model._last_obs = env.reset()  # type: ignore[assignment]
         model._last_episode_starts = np.ones((env.num_envs,), dtype=bool)
         self._zero_states()

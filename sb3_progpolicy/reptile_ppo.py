@@ -84,7 +84,8 @@ class ReptilePPO(PPO):
     :param tasks: a :class:`TaskDistribution`, or what makes one; by default the domain's training variations
     :param n_envs: number of environments to build for an id; 32 by default
     :param env_kwargs: constructor arguments for an id
-    :param inner_updates: k, PPO updates per task
+    :param inner_updates: k, PPO updates per meta-iteration
+    :param tasks_per_iteration: tasks of a meta-iteration, dealt out over the environments; see :class:`ReptileWrapper`
     :param meta_learning_rate: beta, a number or a schedule
     :param meta_optimizer: ``"sgd"`` or ``"adam"``
     :param meta_update: ``False`` for PPO-N: tasks change, the meta-step is left out
@@ -134,6 +135,7 @@ class ReptilePPO(PPO):
         n_envs: int | None = None,
         env_kwargs: Mapping[str, Any] | None = None,
         inner_updates: int = 4,
+        tasks_per_iteration: int = 4,
         meta_learning_rate: float | Schedule = 1.0,
         meta_optimizer: MetaOptimizer = "sgd",
         meta_update: bool = True,
@@ -168,7 +170,8 @@ class ReptilePPO(PPO):
         if tasks is None:
             tasks = default_tasks(self.env_id)
         self.tasks = tasks if isinstance(tasks, TaskDistribution) else TaskDistribution(tasks)
-        self.inner_updates, self.meta_learning_rate = inner_updates, meta_learning_rate
+        self.inner_updates, self.tasks_per_iteration = inner_updates, tasks_per_iteration
+        self.meta_learning_rate = meta_learning_rate
         self.meta_optimizer, self.meta_update = meta_optimizer, meta_update
         self.search_fraction, self.length_coef, self.temperature = search_fraction, length_coef, temperature
         self.normalize_observations = normalize_observations
@@ -210,7 +213,12 @@ class ReptilePPO(PPO):
         super()._setup_model()
         self._check_sequences()
         self.reptile = _Reptile(
-            self.tasks, self.inner_updates, self.meta_learning_rate, self.meta_optimizer, self.meta_update
+            self.tasks,
+            self.inner_updates,
+            self.tasks_per_iteration,
+            self.meta_learning_rate,
+            self.meta_optimizer,
+            self.meta_update,
         )
         self.reptile.meta_iteration = self.meta_iteration
         self.reptile.set_up(self)

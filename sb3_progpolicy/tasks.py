@@ -131,16 +131,27 @@ class TaskDistribution:
     def __len__(self) -> int:
         return len(self.variations)
 
-    def sample(self, rng: np.random.Generator, progress: float = 0.0) -> tuple[int, Variation]:
-        """Draw a task.
+    def sample(self, rng: np.random.Generator, progress: float = 0.0, n_tasks: int = 1) -> list[tuple[int, Variation]]:
+        """Draw tasks, of different variations as long as the sampler lets in enough of them.
 
         :param rng: source of all randomness
         :param progress: of the training, from 0 to 1
-        :return: index into :attr:`variations`, and the variation with every callable replaced by a drawn value
+        :param n_tasks: how many, at least 1
+        :return: for each task its index into :attr:`variations` and its variation, every callable in it replaced by a
+            drawn value
         """
         weights = self.sampler.weights(len(self), progress, self.success_rates)
-        index = int(rng.choice(len(self), p=weights / weights.sum()))
-        return index, {name: value(rng) if callable(value) else value for name, value in self.variations[index].items()}
+        rounds, indices = weights, list[int]()
+        while len(indices) < n_tasks:
+            if not rounds.any():
+                rounds = weights
+            index = int(rng.choice(len(self), p=rounds / rounds.sum()))
+            indices.append(index)
+            rounds = np.where(np.arange(len(self)) == index, 0, rounds)
+        return [
+            (index, {k: value(rng) if callable(value) else value for k, value in self.variations[index].items()})
+            for index in indices
+        ]
 
     def record(self, index: int, success: float) -> None:
         """Update the running success rate of a variation.
@@ -157,19 +168,21 @@ class TaskDistribution:
         parts = (f"{name}={'random' if callable(value) else value}" for name, value in self.variations[index].items())
         return ",".join(parts) or "default"
 
-    def put_in_force(self, env: VecEnv, variation: Variation) -> None:
-        """Make a variation the one that the next reset of ``env`` starts with.
+    def put_in_force(self, env: VecEnv, variations: Sequence[Variation]) -> None:
+        """Make the variations those that the next reset of ``env`` starts with.
 
         :param env: the training environments
-        :param variation: as drawn by :meth:`sample`
+        :param variations: one for each environment
         """
-        if self.apply == "attributes":
-            for name, value in variation.items():
-                env.env_method("set_wrapper_attr", name, value)
-        elif self.apply == "options":
-            env.set_options(dict(variation))
-        else:
-            env.env_method("remake", variation)
+        if self.apply == "options":
+            env.set_options([dict(variation) for variation in variations])
+            return
+        for row, variation in enumerate(variations):
+            if self.apply == "constructor":
+                env.env_method("remake", variation, indices=[row])
+            else:
+                for name, value in variation.items():
+                    env.env_method("set_wrapper_attr", name, value, indices=[row])
 
 
 def default_tasks(env_id: str | None) -> TaskDistribution:
