@@ -38,7 +38,7 @@ class ReptileWrapper(BaseCallback):
 
     :param tasks: what to train on
     :param inner_updates: k, rollouts (each followed by an update) per task, at least 1
-    :param tasks_per_iteration: tasks drawn for a meta-iteration and dealt out over the environments. 1 is algorithm 1 as
+    :param tasks_per_iteration: tasks drawn for a meta-iteration, dealt out over the environments. 1 is algorithm 1 as
         printed; with more, each inner update follows the mean gradient over several tasks, so that it cannot specialise
         on one of them. At most one task per environment
     :param meta_learning_rate: beta, a number or a schedule of the remaining progress (1 to 0)
