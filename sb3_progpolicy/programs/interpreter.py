@@ -61,7 +61,9 @@ def join_inputs(
 
 
 def _encode_actions(action: ActionSpec, given: ArrayLike, n_envs: int) -> Floats:
-    width = 1 if action.kind == "discrete" else len(action.sizes) if action.kind == "multi_discrete" else action.sizes[0]
+    width = (
+        1 if action.kind == "discrete" else len(action.sizes) if action.kind == "multi_discrete" else action.sizes[0]
+    )
     actions = np.asarray(given)
     if actions.size != n_envs * width:
         raise ValueError(
@@ -107,7 +109,12 @@ class ProgramRunner:
         self._n_controllers = len(program.controllers)
         # One map for everything that is affine in X: the gates of all conditions, then all controllers.
         blocks = [cell.rows for cell in self._cells] + [
-            np.column_stack([np.array(controller.bias), np.array(controller.weights).reshape(len(controller.bias), program.n_inputs)])
+            np.column_stack(
+                [
+                    np.array(controller.bias),
+                    np.array(controller.weights).reshape(len(controller.bias), program.n_inputs),
+                ]
+            )
             for controller in program.controllers
         ]
         self._splits = np.cumsum([len(block) for block in blocks])[: len(self._cells)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 from collections.abc import Callable
@@ -173,12 +174,14 @@ def _action(data: Any) -> ActionSpec:
 
 
 def _condition(place: str, data: Any) -> Condition:
-    matrices, vectors = ("weight_ih", "weight_hh"), ("bias_ih", "bias_hh", "readout")
-    fields = _keys(place, data, ("cell", *matrices, *vectors, "readout_bias"))
+    fields = _keys(place, data, tuple(field.name for field in dataclasses.fields(Condition)))
     return Condition(
         cell=_text(f"{place}.cell", fields["cell"]),
-        **{name: _matrix(f"{place}.{name}", fields[name]) for name in matrices},
-        **{name: _vector(f"{place}.{name}", fields[name]) for name in vectors},
+        weight_ih=_matrix(f"{place}.weight_ih", fields["weight_ih"]),
+        weight_hh=_matrix(f"{place}.weight_hh", fields["weight_hh"]),
+        bias_ih=_vector(f"{place}.bias_ih", fields["bias_ih"]),
+        bias_hh=_vector(f"{place}.bias_hh", fields["bias_hh"]),
+        readout=_vector(f"{place}.readout", fields["readout"]),
         readout_bias=_number(f"{place}.readout_bias", fields["readout_bias"]),
     )
 

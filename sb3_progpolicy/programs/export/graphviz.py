@@ -74,7 +74,10 @@ class _DotPrinter(ProgramVisitor[list[str]]):
 
     def _condition(self, condition: Condition, index: int) -> list[str]:
         if condition.cell == "affine":
-            return [f"B{index + 1} >= 0 ?", self._sum(condition.readout_bias, condition.readout, self.program.input_names)]
+            return [
+                f"B{index + 1} >= 0 ?",
+                self._sum(condition.readout_bias, condition.readout, self.program.input_names),
+            ]
         units = [f"h{unit + 1}" for unit in range(condition.hidden_size)]
         heard = largest_terms(0.0, input_importance(condition), self.program.input_names, 9, self.max_terms)
         return [
@@ -86,7 +89,10 @@ class _DotPrinter(ProgramVisitor[list[str]]):
 
     def _sum(self, constant: float, weights: tuple[float, ...], names: Any) -> str:
         terms = largest_terms(constant, weights, names, self.decimals, self.max_terms)
-        tokens = [f"{constant:.{self.decimals}f}", *(f"{weight:+.{self.decimals}f} {name}" for weight, name in terms.shown)]
+        tokens = [
+            f"{constant:.{self.decimals}f}",
+            *(f"{weight:+.{self.decimals}f} {name}" for weight, name in terms.shown),
+        ]
         return "  ".join(tokens) + (" ..." if terms.n_dropped else "")
 
 

@@ -59,14 +59,21 @@ class _LatexPrinter(ProgramVisitor[list[str]]):
     def print(self) -> str:
         program = self.program
         blocks = [
-            [r"\[", r"y(x) = \begin{cases}", *self.visit(program.body), r"\end{cases}", rf"\qquad {_rule(program.action)}", r"\]"],
+            [
+                r"\[",
+                r"y(x) = \begin{cases}",
+                *self.visit(program.body),
+                r"\end{cases}",
+                rf"\qquad {_rule(program.action)}",
+                r"\]",
+            ],
             [r"\[", rf"x = {self._names(program.input_names)} \qquad y = {self._names(program.output_names)}", r"\]"],
         ]
         for index, condition in enumerate(program.conditions, start=1):
             blocks.append([r"\[", r"\begin{aligned}", *self._condition(condition, index), r"\end{aligned}", r"\]"])
         for index, controller in enumerate(program.controllers, start=1):
-            matrices = rf"c_{{{index}}} = {self._vector(controller.bias)} \quad T_{{{index}}} = {self._matrix(controller.weights)}"
-            blocks.append([r"\[", matrices, r"\]"])
+            constant = rf"c_{{{index}}} = {self._vector(controller.bias)}"
+            blocks.append([r"\[", rf"{constant} \quad T_{{{index}}} = {self._matrix(controller.weights)}", r"\]"])
         body = "\n".join(line for block in blocks for line in block)
         return f"{{\\scriptsize\\setlength{{\\arraycolsep}}{{2pt}}\n{body}\n}}\n"
 

@@ -20,6 +20,7 @@ INK, QUIET, LINE = "#263238", "#78858c", "#b4bec4"
 CONDITION_FILL, CONDITION_EDGE = "#fdf3dc", "#e0a526"
 LEAF_FILL, LEAF_EDGE = "#ffffff", "#b4bec4"
 RAISES, LOWERS = "#12715b", "#b5411f"
+MINUS = "\N{MINUS SIGN}"
 # Inches of the natural size; monospaced text makes every width known before drawing.
 FONT_SIZE, CHARACTER, ROW, PAD, GAP = 9.0, 0.0753, 0.205, 0.14, 0.34
 MAX_ROWS = 12
@@ -64,9 +65,13 @@ def plot_program(
     pairs = cards.visit(program.body)
     left = max((condition.width for condition, _ in pairs if condition), default=0.0)
     arrow = 0.75 if left else 0.0
-    width = left + arrow + max(leaf.width for _, leaf in pairs) + 2 * GAP
+    reading = _how_to_read(program)
+    texts = max(CHARACTER * 0.9 * len(line) for line in reading)
+    right = max(leaf.width for _, leaf in pairs)
+    width = max(left + arrow + right, texts) + 2 * GAP
     heights = [max(leaf.height, condition.height if condition else 0) for condition, leaf in pairs]
-    height = sum(heights) + GAP * (len(pairs) + 1) + 2 * ROW
+    heading = ROW * (1.6 + len(reading))
+    height = sum(heights) + GAP * (len(pairs) + 1) + heading + 0.5 * GAP
     if ax is None:
         _, ax = plt.subplots(figsize=(width, height), layout="none")
         ax.set_position((0, 0, 1, 1))
@@ -77,15 +82,32 @@ def plot_program(
     ax.set(xlim=(0, width), ylim=(0, height), aspect="equal")
     ax.axis("off")
     canvas = _Canvas(ax, scale)
-    canvas.text(GAP, height - GAP * 0.9, title(program), INK, weight="bold", size=1.25)
-    y = height - GAP - 2 * ROW
+    canvas.text(GAP, height - GAP - 0.3 * ROW, title(program), INK, weight="bold", size=1.3)
+    for number, line in enumerate(reading):
+        canvas.text(GAP, height - GAP - ROW * (1.6 + number), line, QUIET, size=0.9)
+    y = height - 1.5 * GAP - heading
     above: tuple[float, float] | None = None
     for (condition, leaf), row_height in zip(pairs, heights, strict=True):
         middle = y - row_height / 2
-        canvas.card(leaf, GAP + left + arrow, middle, LEAF_FILL, LEAF_EDGE)
+        canvas.card(leaf, GAP + left + arrow, middle, LEAF_FILL, LEAF_EDGE, width=right)
         above = canvas.connect(condition, above, left, arrow, middle)
         y -= row_height + GAP
     return ax
+
+
+def _how_to_read(program: Program) -> tuple[str, ...]:
+    """Two lines for a reader who has never seen a program."""
+    what = {
+        "discrete": "The score of each action: the highest wins.",
+        "multi_discrete": "The score of each choice: in each part of the action the highest wins.",
+        "multi_binary": "The score of each switch: above 0 it is on.",
+        "box": "The numbers of the action, clipped to their bounds.",
+    }[program.action.kind]
+    order = "Read from top to bottom: the first condition that holds decides. " if program.conditions else ""
+    return (
+        f"{order}{what}",
+        "Constant first, then the largest terms: green raises the value, red lowers it, … stands for smaller terms.",
+    )
 
 
 class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
@@ -112,7 +134,7 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
             constant, terms = self._terms(condition.readout_bias, condition.readout, units)
             heard = largest_terms(0.0, input_importance(condition), inputs, 9, self.max_terms)
             lines = [f"memory h: {counted(condition.hidden_size, f'{CELL_NAMES[condition.cell]} unit')}"]
-            lines += ["listens most to", *(f"  {name}" for _, name in heard.shown)] if heard.shown else []
+            lines += ["listens most to", *(f"  {_arrows(name)}" for _, name in heard.shown)] if heard.shown else []
         number = index + 1
         formula = [(f"B{number} = {constant}", INK, 0)]
         for text, colour in terms:
@@ -121,7 +143,7 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
         return _Card((head, tuple(formula), *(((line, QUIET, 0),) for line in lines)))
 
     def _leaf(self, controller: Controller) -> _Card:
-        names = self.program.output_names
+        names = [_arrows(name) for name in self.program.output_names]
         shown = min(len(names), self.max_outputs)
         sums = [
             self._terms(controller.bias[row], controller.weights[row], self.program.input_names) for row in range(shown)
@@ -139,13 +161,24 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
             rows.append(((f"... and {len(names) - shown} more outputs", QUIET, 0),))
         return _Card(tuple(rows))
 
-    def _terms(self, constant: float, weights: Sequence[float], names: Sequence[str]) -> tuple[str, list[tuple[str, str]]]:
+    def _terms(
+        self, constant: float, weights: Sequence[float], names: Sequence[str]
+    ) -> tuple[str, list[tuple[str, str]]]:
         terms = largest_terms(constant, weights, names, self.decimals, self.max_terms)
         shown = [
-            (f"{weight:+.{self.decimals}f} {name}".replace("-", "−", weight < 0), RAISES if weight > 0 else LOWERS)
+            (f"{_number(weight, self.decimals, '+')} {_arrows(name)}", RAISES if weight > 0 else LOWERS)
             for weight, name in terms.shown
         ]
-        return f"{constant:.{self.decimals}f}".replace("-", "−"), [*shown, *([("…", QUIET)] if terms.n_dropped else [])]
+        return _number(constant, self.decimals), [*shown, *([("…", QUIET)] if terms.n_dropped else [])]
+
+
+def _number(value: float, decimals: int, sign: str = "") -> str:
+    shown = round(value, decimals) or 0.0  # no "-0.0"
+    return f"{shown:{sign}.{decimals}f}".replace("-", MINUS)
+
+
+def _arrows(name: str) -> str:
+    return name.replace("->", "→")
 
 
 class _Canvas:
@@ -154,19 +187,27 @@ class _Canvas:
     def __init__(self, ax: Any, scale: float) -> None:
         self.ax, self.scale = ax, scale
 
-    def text(self, x: float, y: float, text: str, colour: str, weight: str = "normal", size: float = 1.0, **options: Any) -> None:
+    def text(
+        self, x: float, y: float, text: str, colour: str, weight: str = "normal", size: float = 1.0, **options: Any
+    ) -> None:
         # parse_math: names are data, a dollar sign in one is no formula.
         options = {"va": "center", "family": "DejaVu Sans Mono", "parse_math": False, **options}
         self.ax.text(x, y, text, color=colour, weight=weight, size=FONT_SIZE * size * self.scale, **options)
 
-    def card(self, card: _Card, x: float, middle: float, fill: str, edge: str) -> None:
+    def card(self, card: _Card, x: float, middle: float, fill: str, edge: str, width: float | None = None) -> None:
         from matplotlib.patches import FancyBboxPatch
 
         corner = (x, middle - card.height / 2)
         style = "round,pad=0,rounding_size=0.08"
         self.ax.add_patch(
             FancyBboxPatch(
-                corner, card.width, card.height, boxstyle=style, facecolor=fill, edgecolor=edge, lw=1.1 * self.scale
+                corner,
+                width or card.width,
+                card.height,
+                boxstyle=style,
+                facecolor=fill,
+                edgecolor=edge,
+                lw=1.1 * self.scale,
             )
         )
         for number, row in enumerate(card.rows):
@@ -190,8 +231,8 @@ class _Canvas:
         if above is not None:
             self._arrow([above, (trunk, middle + condition.height / 2)])
             self.text(trunk + 0.12, above[1] - GAP / 2, "no", QUIET)
-        self.card(condition, trunk - condition.width / 2, middle, CONDITION_FILL, CONDITION_EDGE)
-        right = trunk + condition.width / 2
+        self.card(condition, GAP, middle, CONDITION_FILL, CONDITION_EDGE, width=left)
+        right = GAP + left
         self._arrow([(right, middle), (leaf, middle)])
         self.text((right + leaf) / 2 - 0.06, middle + 0.11, "yes", QUIET, ha="center")
         return trunk, middle - condition.height / 2

@@ -5,7 +5,7 @@ from __future__ import annotations
 import keyword
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,10 +15,19 @@ from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, Pr
 WIDTH = 110
 TERMS_PER_STATEMENT = 50  # Python's own parser and compiler limit how long a sum may be
 _MAX_IDENTIFIER = 40
-_TAKEN = frozenset(
-    "self observation previous_action previous_reward previous_done reward done action scores tanh float int len max min "
-    "range list tuple bool map str ValueError".split()
-)
+# Names that the written method uses itself.
+_TAKEN = {
+    "self",
+    "observation",
+    "previous_action",
+    "previous_reward",
+    "previous_done",
+    "reward",
+    "done",
+    "action",
+    "scores",
+}
+_TAKEN |= {"tanh", "float", "int", "len", "max", "min", "map"}
 
 
 def export_python(program: Program, out_file: str | os.PathLike[str] | Any | None = None) -> str | None:
@@ -62,7 +71,10 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
 
     def print(self) -> str:
         act = [*self._read_inputs(), *self._advance_conditions(), *self.visit(self.program.body)]
-        return "\n".join([*self._head(), *self.tables, "", *self._class(), *(f"        {line}".rstrip() for line in act)]) + "\n"
+        return (
+            "\n".join([*self._head(), *self.tables, "", *self._class(), *(f"        {line}".rstrip() for line in act)])
+            + "\n"
+        )
 
     def visit_branch(self, branch: IfThenElse, index: int) -> list[str]:
         word = "elif" if index else "if"
@@ -111,7 +123,8 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
             "    def act(self, observation, previous_action=None, previous_reward=0.0, previous_done=False):",
             f'        """Choose an action: {self._action_words()}.',
             "",
-            f"        observation: {counted(program.n_observations, 'number')}. previous_action: what the last call returned, None before the first.",
+            f"        observation: {counted(program.n_observations, 'number')}.",
+            "        previous_action: what the last call returned, None before the first.",
             "        previous_reward, previous_done: what the environment said after it.",
             '        """',
         ]
@@ -130,7 +143,9 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
         states = []
         for index, condition in enumerate(self.program.conditions, start=1):
             kinds = {"affine": "", "lstm": "hc"}.get(condition.cell, "h")
-            states += [(f"{kind}{index}", [f"{kind}{index}_{u + 1}" for u in range(condition.hidden_size)]) for kind in kinds]
+            states += [
+                (f"{kind}{index}", [f"{kind}{index}_{u + 1}" for u in range(condition.hidden_size)]) for kind in kinds
+            ]
         return states
 
     def _read_inputs(self) -> list[str]:
@@ -148,7 +163,8 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
         if action.kind == "discrete":
             lines += _index("action", "previous_action", action.start, action.sizes[0])
         elif action.kind == "multi_discrete":
-            lines += [f"{_tuple(f'given_{part}' for part in range(self.parts))} = [None] * {self.parts} if previous_action is None else previous_action"]
+            source = f"[None] * {self.parts} if previous_action is None else previous_action"
+            lines += _unpack([f"given_{part}" for part in range(self.parts)], source)
             for part, size in enumerate(action.sizes):
                 lines += _index(f"action_{part}", f"given_{part}", 0, size)
         else:
@@ -200,12 +216,18 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
             return [*lines, *_list("return", (f"1 if {name} > 0.0 else 0" for name in names))]
         if action.kind == "box":
             bounds = zip(names, action.low, action.high, strict=True)
-            return [*lines, *_list("return", (f"min(max({n}, {_float(low)}), {_float(high)})" for n, low, high in bounds))]
+            return [
+                *lines,
+                *_list("return", (f"min(max({n}, {_float(low)}), {_float(high)})" for n, low, high in bounds)),
+            ]
         first = 0
         for part, size in enumerate(action.sizes):
             lines.append(f"scores_{part} = {_tuple(names[first : first + size])}")
             first += size
-        return [*lines, *_list("return", (f"scores_{p}.index(max(scores_{p}))" for p in range(self.parts or len(action.sizes))))]
+        return [
+            *lines,
+            *_list("return", (f"scores_{p}.index(max(scores_{p}))" for p in range(self.parts or len(action.sizes)))),
+        ]
 
     def _affine(self, rows: Sequence[_Row], table: str) -> list[str]:
         """Statements that compute all rows, in the order of X; a table answers for a one-hot previous action."""
@@ -216,12 +238,11 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
             columns = [[row.weights[first + choice] for row in rows] for choice in range(size)]
             first += size
             if any(weight for column in columns for weight in column):
-                suffix = f"_{part}" if self.parts > 1 else ""
+                suffix = "" if self.program.action.kind == "discrete" else f"_{part}"
                 names = [f"p{suffix}_{number}" for number in range(len(rows))]
                 self._table(f"{table}_AFTER_ACTION{suffix}", columns, first - size)
                 index = f"action{suffix}"
-                lines += pack([f"{name}," for name in names], "(", "    ", WIDTH - 12)
-                lines[-1] += f") = {table}_AFTER_ACTION{suffix}[{index}]"
+                lines += _unpack(names, f"{table}_AFTER_ACTION{suffix}[{index}]")
                 picked.append(names)
         for number, row in enumerate(rows):
             terms = list(zip(row.weights[:n], self.inputs, strict=True))
@@ -239,7 +260,7 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
         self.tables += ["", f"{name} = ("]
         for choice, column in enumerate(columns):
             comment = f"# {self.program.input_names[first + choice]}"
-            self.tables += [f"    {comment}", *pack([f"{_float(weight)}," for weight in column], "    (", "     ", WIDTH)]
+            self.tables += [f"    {comment}", *pack(_separated(map(_float, column)), "    (", "     ", WIDTH)]
             self.tables[-1] += "),"
         self.tables += ["    # no action yet", f"    (0.0,) * {len(columns[0])},", ")"]
 
@@ -316,21 +337,27 @@ def _index(name: str, given: str, start: int, size: int) -> list[str]:
 
 
 def _unpack(names: Sequence[str], source: str) -> list[str]:
-    lines = pack([f"{name}," for name in names], "(", " ", WIDTH - 30)
+    lines = pack(_separated(names), "(", " ", WIDTH - 30)
     lines[-1] += f") = {source}"
     return lines
 
 
-def _tuple(items: Any) -> str:
-    return "(" + " ".join(f"{item}," for item in items) + ")"
+def _separated(items: Iterable[str]) -> list[str]:
+    """The items of a tuple, with commas as Python wants them."""
+    *first, last = items
+    return [*(f"{item}," for item in first), last if first else f"{last},"]
 
 
-def _list(start: str, items: Any) -> list[str]:
+def _tuple(items: Iterable[str]) -> str:
+    return f"({' '.join(_separated(items))})"
+
+
+def _list(start: str, items: Iterable[str]) -> list[str]:
     return [f"{start} [", *(f"    {item}," for item in items), "]"]
 
 
 def _strings(name: str, values: Sequence[str]) -> list[str]:
-    return [f"{name} = (", *pack([f"{ascii(value)}," for value in values], "        ", "        ", WIDTH), "    )"]
+    return [f"{name} = (", *pack([f"{value!a}," for value in values], "        ", "        ", WIDTH), "    )"]
 
 
 def _float(value: float) -> str:

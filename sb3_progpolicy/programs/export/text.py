@@ -52,7 +52,11 @@ class _TextPrinter(ProgramVisitor[list[str]]):
             lines += ["", *self._condition(condition, index)]
         cells = sorted({condition.cell for condition in self.program.conditions} & set(_RULES))
         if cells:
-            lines += ["", *(_RULES[cell] for cell in cells), "All memory starts at 0 and is kept until the task changes."]
+            lines += [
+                "",
+                *(_RULES[cell] for cell in cells),
+                "All memory starts at 0 and is kept until the task changes.",
+            ]
         return "\n".join(lines) + "\n"
 
     def visit_branch(self, branch: IfThenElse, index: int) -> list[str]:
@@ -72,6 +76,10 @@ class _TextPrinter(ProgramVisitor[list[str]]):
             f"{title(program)}: {counted(n_conditions, 'condition')}, {counted(n_conditions + 1, 'controller')}.",
             f"{reads}.",
             action_rule(program.action),
+            *(
+                ["The first B from the top that is not below 0 decides; all are computed at every step."]
+                * (n_conditions > 1)
+            ),
         ]
 
     def _lines(self, controller: Controller) -> list[str]:
@@ -103,16 +111,22 @@ class _TextPrinter(ProgramVisitor[list[str]]):
             recurrent, constant = condition.weight_hh[row], condition.bias_ih[row] + condition.bias_hh[row]
             label = f"{INDENT}h{unit + 1} = " if gate == "h" else f"{INDENT}{gate}{unit + 1} = "
             if gate != "n":
-                gates.append(self._sum(f"{label}{squash}(", constant, (*condition.weight_ih[row], *recurrent), names, ")"))
+                gates.append(
+                    self._sum(f"{label}{squash}(", constant, (*condition.weight_ih[row], *recurrent), names, ")")
+                )
                 continue
             # r scales the recurrent part of n alone, so that part is a sum of its own.
             inner = " ".join(self._tokens(condition.bias_hh[row], recurrent, names[self.program.n_inputs :]))
             close = ")" if inner in ("0", "-0") else f" + r{unit + 1}*({inner}))"
             inputs = names[: self.program.n_inputs]
-            gates.append(self._sum(f"{label}{squash}(", condition.bias_ih[row], condition.weight_ih[row], inputs, close))
+            gates.append(
+                self._sum(f"{label}{squash}(", condition.bias_ih[row], condition.weight_ih[row], inputs, close)
+            )
         return gates
 
-    def _sum(self, start: str, constant: float, weights: Sequence[float], names: Sequence[str], close: str = "") -> list[str]:
+    def _sum(
+        self, start: str, constant: float, weights: Sequence[float], names: Sequence[str], close: str = ""
+    ) -> list[str]:
         tokens = self._tokens(constant, weights, names)
         tokens[-1] += close
         return pack(tokens, start, " " * len(start), WIDTH)
