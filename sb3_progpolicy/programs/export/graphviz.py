@@ -90,7 +90,7 @@ class _DotPrinter(ProgramVisitor[list[str]]):
     def _sum(self, constant: float, weights: tuple[float, ...], names: Any) -> str:
         terms = largest_terms(constant, weights, names, self.decimals, self.max_terms)
         tokens = [
-            f"{constant:.{self.decimals}f}",
+            f"{round(constant, self.decimals) or 0.0:.{self.decimals}f}",
             *(f"{weight:+.{self.decimals}f} {name}" for weight, name in terms.shown),
         ]
         return "  ".join(tokens) + (" ..." if terms.n_dropped else "")

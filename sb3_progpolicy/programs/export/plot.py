@@ -66,7 +66,7 @@ def plot_program(
     left = max((condition.width for condition, _ in pairs if condition), default=0.0)
     arrow = 0.75 if left else 0.0
     reading = _how_to_read(program)
-    texts = max(CHARACTER * 0.9 * len(line) for line in reading)
+    texts = max(CHARACTER * len(line) for line in reading)
     right = max(leaf.width for _, leaf in pairs)
     width = max(left + arrow + right, texts) + 2 * GAP
     heights = [max(leaf.height, condition.height if condition else 0) for condition, leaf in pairs]
