@@ -71,10 +71,9 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
 
     def print(self) -> str:
         act = [*self._read_inputs(), *self._advance_conditions(), *self.visit(self.program.body)]
-        return (
-            "\n".join([*self._head(), *self.tables, "", *self._class(), *(f"        {line}".rstrip() for line in act)])
-            + "\n"
-        )
+        act = [f"        {line}".rstrip() for line in act]
+        tables = ["", "", "# What the previous action adds to each of the sums above."] if self.tables else []
+        return "\n".join([*self._head(), *self._class(), *act, *tables, *self.tables]) + "\n"
 
     def visit_branch(self, branch: IfThenElse, index: int) -> list[str]:
         word = "elif" if index else "if"
@@ -160,6 +159,10 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
         lines += [f"# {identifier}: {name}" for identifier, name in zip(self.inputs, program.input_names, strict=False)]
         if not program.interaction:
             return lines
+        if self.one_hot:
+            lines.append(
+                "# Actions pick rows of the tables at the end of the file; -1, the last row, is for no action."
+            )
         if action.kind == "discrete":
             lines += _index("action", "previous_action", action.start, action.sizes[0])
         elif action.kind == "multi_discrete":
@@ -290,6 +293,8 @@ def _sum(name: str, constant: float | None, terms: Sequence[tuple[float, str]]) 
     start, lines = name if constant is None else _float(constant), []
     for first in range(0, max(len(kept), constant is not None), TERMS_PER_STATEMENT):
         tokens = [start, *map(_token, kept[first : first + TERMS_PER_STATEMENT])]
+        if len(tokens) > 1 and start in ("0.0", "-0.0"):
+            tokens = [tokens[1].replace("- ", "-", 1) if tokens[1][0] == "-" else tokens[1][2:], *tokens[2:]]
         if len(name) + sum(len(token) + 1 for token in tokens) <= WIDTH - 15:
             lines.append(f"{name} = {' '.join(tokens)}")
         else:
