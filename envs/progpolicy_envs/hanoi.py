@@ -23,12 +23,13 @@ VARIATIONS = VariationSpace(
     IntParameter("source", 0, N_PEGS - 1, "peg on which all discs start", (RANDOM,)),
     IntParameter("target", 0, N_PEGS - 1, "peg to which all discs go; not the source", (RANDOM,)),
 )
+_N_TOPS = MAX_DISCS + 1  # a peg's top disc, or none
 STEP_REWARD, ILLEGAL_REWARD, GOAL_REWARD = -0.01, -0.05, 1.0
 
 OBSERVATION_NAMES = tuple(f"{feature}[{peg}]" for peg in range(N_PEGS) for feature in ("rank", "colour", "empty"))
 ACTION_NAMES = tuple(f"move {source}->{target}" for source, target in MOVES)
 _OBSERVATION_SPACE = spaces.Box(
-    np.array([-1, -1, 0] * N_PEGS, dtype=np.float32), np.array([1, 1, 1] * N_PEGS, dtype=np.float32), dtype=np.float32
+    np.tile(np.array([-1, -1, 0], np.float32), N_PEGS), np.ones(3 * N_PEGS, np.float32), dtype=np.float32
 )
 
 
@@ -232,6 +233,22 @@ class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
         return "\n".join([*rows, base]) + "\n"
 
 
+def _all_observations() -> NDArray[np.float32]:
+    """Return the observation of every triple of top discs and of base colours, in the order in which they are coded.
+
+    A look-up is several times faster than comparing the pegs at every step, and the table is small.
+
+    :return: ``(13**3 * 2**3, 9)``; the first peg counts most, the colours of the three bases are the last three bits
+    """
+    tops = np.stack(np.meshgrid(*[np.arange(_N_TOPS)] * N_PEGS, indexing="ij"), axis=-1).reshape(-1, 1, N_PEGS)
+    bases = (np.arange(2**N_PEGS)[:, None] >> np.arange(N_PEGS)) & 1
+    observations = np.empty((_N_TOPS**N_PEGS, 2**N_PEGS, N_PEGS, 3), dtype=np.float32)
+    observations[..., 0] = np.sign(tops[..., None] - tops[..., None, :]).sum(axis=-1) / 2
+    observations[..., 1] = 2 * np.where(tops == MAX_DISCS, bases, tops % 2) - 1
+    observations[..., 2] = tops == MAX_DISCS
+    return observations.reshape(-1, 3 * N_PEGS)
+
+
 class HanoiVectorEnv(PlanningVectorEnv):
     """N towers stepped at once, equal to N :class:`HanoiEnv` step for step.
 
@@ -252,7 +269,7 @@ class HanoiVectorEnv(PlanningVectorEnv):
     _FROM, _TO = (np.array(column) for column in zip(*MOVES, strict=True))
     # Lowest bit set of every set of discs; an empty peg reads MAX_DISCS, larger than any disc.
     _TOP = np.array([(bits & -bits).bit_length() - 1 if bits else MAX_DISCS for bits in range(2**MAX_DISCS)])
-    _SHADE = np.array([2 * (top % 2) - 1 for top in range(MAX_DISCS)] + [0], dtype=np.float32)
+    _OBSERVATIONS = _all_observations()
 
     def __init__(
         self,
@@ -272,7 +289,7 @@ class HanoiVectorEnv(PlanningVectorEnv):
         self._full = np.zeros(num_envs, dtype=np.int64)
         self._source = np.zeros(num_envs, dtype=np.int64)
         self._target = np.zeros(num_envs, dtype=np.int64)
-        self._base_shade = np.zeros((num_envs, N_PEGS), dtype=np.float32)
+        self._bases = np.zeros(num_envs, dtype=np.int64)
         self._random = np.zeros(num_envs, dtype=bool)
         self._read_variations()
 
@@ -295,7 +312,7 @@ class HanoiVectorEnv(PlanningVectorEnv):
         pegs = np.array([_draw_pegs(self.row_variations[row], self._generators[row]) for row in rows])
         self._source[rows], self._target[rows] = pegs.T
         continues = (np.arange(N_PEGS) == pegs[:, :1]) | (np.arange(N_PEGS) == pegs[:, 1:])
-        self._base_shade[rows] = 2 * ((self._n_discs[rows, None] + ~continues) % 2) - 1.0
+        self._bases[rows] = ((self._n_discs[rows, None] + ~continues) % 2) @ (1 << np.arange(N_PEGS))
 
     def _reset_rows(self, rows: NDArray[np.intp]) -> None:
         self._place_pegs(rows[self._random[rows]])
@@ -320,13 +337,9 @@ class HanoiVectorEnv(PlanningVectorEnv):
 
     def _observe(self) -> NDArray[np.float32]:
         tops = self._tops
-        observations = np.empty((self.num_envs, N_PEGS, 3), dtype=np.float32)
-        empty = tops == MAX_DISCS
-        order = np.sign(tops - tops[:, (1, 2, 0)])  # of pegs 0-1, 1-2 and 2-0
-        observations[:, :, 0] = (order - order[:, (2, 0, 1)]) / 2
-        observations[:, :, 1] = np.where(empty, self._base_shade, self._SHADE[tops])
-        observations[:, :, 2] = empty
-        return observations.reshape(self.num_envs, -1)
+        return self._OBSERVATIONS.take(
+            ((tops[:, 0] * _N_TOPS + tops[:, 1]) * _N_TOPS + tops[:, 2]) * 2**N_PEGS + self._bases, axis=0
+        )
 
     def _optimal_steps(self) -> NDArray[np.int64]:
         return self._full.copy()

@@ -1,0 +1,39 @@
+"""The domains: which variations are trained on, which are unseen, and that every one of them is accepted."""
+
+import gymnasium as gym
+import pytest
+
+from progpolicy_envs import DOMAINS, MAX_EPISODE_STEPS, get_domain
+
+SIZES = {
+    "Hanoi-v0": ({1, 2, 3, 4}, {5, 6, 7, 8}),
+}
+
+
+@pytest.mark.parametrize("env_id", SIZES)
+def test_training_and_unseen_sizes_are_those_of_the_specification(env_id: str) -> None:
+    domain = DOMAINS[env_id]
+    train, unseen = ({variation[domain.size] for variation in part} for part in (domain.train, domain.unseen))
+    assert (train, unseen) == SIZES[env_id]
+    assert next(iter(domain.train))[domain.size] == min(train), "the easiest comes first"
+
+
+@pytest.mark.parametrize("env_id", SIZES)
+def test_every_variation_is_accepted_and_has_a_plan_within_the_cap(env_id: str) -> None:
+    domain = DOMAINS[env_id]
+    env = gym.make(env_id)
+    assert env.spec is not None
+    assert env.spec.max_episode_steps == MAX_EPISODE_STEPS == 500
+    for variation in (*domain.train, *domain.unseen):
+        _, info = env.reset(seed=0, options=variation)
+        assert info["variation"].items() >= variation.items()
+        assert 1 <= info["optimal_steps"] <= MAX_EPISODE_STEPS
+
+
+def test_domain_is_found_with_and_without_module_prefix() -> None:
+    assert get_domain("progpolicy_envs:Hanoi-v0") is get_domain("Hanoi-v0") is DOMAINS["Hanoi-v0"]
+
+
+def test_unknown_domain_is_answered_with_the_nearest() -> None:
+    with pytest.raises(ValueError, match="'Hanoy-v0' is not one of this package's environments; nearest: Hanoi-v0"):
+        get_domain("Hanoy-v0")

@@ -1,0 +1,239 @@
+"""Hanoi-v0, held against the puzzle's rules rather than against its own code."""
+
+import os
+import subprocess
+import sys
+from collections import deque
+from itertools import pairwise, permutations, product
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import progpolicy_envs
+from progpolicy_envs.hanoi import ACTION_NAMES, MOVES, OBSERVATION_NAMES, HanoiEnv
+from progpolicy_envs.planners import hanoi as planner
+from tests.envs.helpers import assert_checkers_are_silent, assert_long_run_stays_sound, assert_picture_shows_the_state
+from tests.handwritten.evaluate import CrispPolicy, play, size_of
+from tests.handwritten.hanoi import hanoi_program
+
+
+class Referee:
+    """The puzzle as Lucas describes it: three piles, only a top disc is moved, never onto a smaller one."""
+
+    def __init__(self, n_discs: int, source: int) -> None:
+        self.piles: list[list[int]] = [[], [], []]
+        self.piles[source] = list(range(n_discs, 0, -1))
+
+    def move(self, source: int, target: int) -> None:
+        assert self.piles[source], f"no disc on peg {source}"
+        disc = self.piles[source].pop()
+        assert all(disc < other for other in self.piles[target]), f"disc {disc} onto a smaller one"
+        self.piles[target].append(disc)
+
+
+@pytest.mark.parametrize("n_discs", range(1, 11))
+@pytest.mark.parametrize(("source", "target"), list(permutations(range(3), 2)))
+def test_plan_obeys_the_rules_of_the_puzzle_and_is_shortest(n_discs: int, source: int, target: int) -> None:
+    referee = Referee(n_discs, source)
+    moves = list(planner.plan([source] * n_discs, target))
+    for move in moves:
+        referee.move(*move)
+    assert referee.piles[target] == list(range(n_discs, 0, -1))
+    assert len(moves) == 2**n_discs - 1 == planner.optimal_steps([source] * n_discs, target)
+
+
+@pytest.mark.parametrize("n_discs", range(1, 6))
+@pytest.mark.parametrize("target", range(3))
+def test_planner_is_as_short_as_breadth_first_search_from_every_state(n_discs: int, target: int) -> None:
+    goal = (target,) * n_discs
+    distance, queue = {goal: 0}, deque([goal])
+    while queue:
+        discs = queue.popleft()
+        for source, to in MOVES:
+            at_source = [disc for disc in range(n_discs) if discs[disc] == source]
+            if at_source and all(disc > at_source[0] for disc in range(n_discs) if discs[disc] == to):
+                moved = (*discs[: at_source[0]], to, *discs[at_source[0] + 1 :])
+                if moved not in distance:
+                    distance[moved] = distance[discs] + 1
+                    queue.append(moved)
+    assert len(distance) == 3**n_discs
+    for discs in product(range(3), repeat=n_discs):
+        assert planner.optimal_steps(discs, target) == distance[discs] == len(list(planner.plan(discs, target)))
+
+
+@pytest.mark.parametrize("n_discs", [1, 2, 7, 12])
+def test_environment_takes_the_plan_and_ends_at_its_last_move_only(n_discs: int) -> None:
+    env = HanoiEnv(n_discs=n_discs)
+    _, info = env.reset()
+    assert info["optimal_steps"] == 2**n_discs - 1
+    for left, move in reversed(list(enumerate(reversed(list(planner.plan(env.discs, 2)))))):
+        _, reward, terminated, truncated, info = env.step(MOVES.index(move))
+        assert (terminated, truncated, info["is_success"]) == (left == 0, False, left == 0)
+        assert reward == pytest.approx(-0.01 + (left == 0))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    n_discs=st.integers(1, 12),
+    pegs=st.permutations(range(3)),
+    actions=st.lists(st.integers(0, 5), max_size=80),
+)
+def test_any_actions_keep_the_state_legal_and_the_observation_inside_its_space(
+    n_discs: int, pegs: list[int], actions: list[int]
+) -> None:
+    env = HanoiEnv(n_discs=n_discs, source=pegs[0], target=pegs[1])
+    observation, _ = env.reset()
+    referee = Referee(n_discs, pegs[0])
+    for action in actions:
+        assert env.observation_space.contains(observation)
+        source, target = MOVES[action]
+        pile, onto = referee.piles[source], referee.piles[target]
+        legal = bool(pile) and (not onto or pile[-1] < onto[-1])
+        if legal:
+            referee.move(source, target)
+        observation, reward, terminated, _, _ = env.step(action)
+        assert env.discs == [peg for disc in range(1, n_discs + 1) for peg in range(3) if disc in referee.piles[peg]]
+        assert terminated == (len(referee.piles[pegs[1]]) == n_discs)
+        assert reward == pytest.approx(-0.01 - 0.05 * (not legal) + terminated)
+
+
+def test_observation_is_what_the_docstring_says() -> None:
+    env = HanoiEnv(n_discs=3, source=0, target=2)
+    observation, _ = env.reset()
+    named = dict(zip(OBSERVATION_NAMES, observation, strict=True))
+    # Three discs are coloured -1, +1, -1; the bases of source and target go on with +1, the spare one is -1.
+    assert [named[f"rank[{peg}]"] for peg in range(3)] == [-1, 0.5, 0.5]
+    assert [named[f"colour[{peg}]"] for peg in range(3)] == [-1, -1, 1]
+    assert [named[f"empty[{peg}]"] for peg in range(3)] == [0, 1, 1]
+    observation, *_ = env.step(ACTION_NAMES.index("move 0->2"))
+    named = dict(zip(OBSERVATION_NAMES, observation, strict=True))
+    assert [named[f"rank[{peg}]"] for peg in range(3)] == [0, 1, -1]
+    assert [named[f"colour[{peg}]"] for peg in range(3)] == [1, -1, -1]
+    assert [named[f"empty[{peg}]"] for peg in range(3)] == [0, 1, 0]
+
+
+@pytest.mark.parametrize("n_discs", range(1, 11))
+def test_handwritten_controller_is_optimal_on_training_and_unseen_variations(n_discs: int) -> None:
+    program = hanoi_program()
+    assert size_of(program) == (0, 1)
+    env = gym.make("Hanoi-v0", max_episode_steps=2**10)
+    for source, target in permutations(range(3), 2):
+        episode = play(program, env, n_discs=n_discs, source=source, target=target)
+        assert episode.success
+        assert episode.steps == episode.optimal == 2**n_discs - 1
+
+
+def test_handwritten_controller_stays_optimal_when_its_history_survives_episodes() -> None:
+    policy = CrispPolicy(hanoi_program())
+    env = gym.make("Hanoi-v0", n_discs=4)
+    assert [play(policy, env).steps for _ in range(4)] == [15] * 4
+
+
+def test_source_and_target_must_differ() -> None:
+    with pytest.raises(ValueError, match=r"source=1 and target=1 .* two different pegs from 0 to 2"):
+        HanoiEnv(source=1, target=1)
+    env = HanoiEnv(source=0, target=2)
+    with pytest.raises(ValueError, match="source=2 and target=2"):
+        env.reset(options={"source": 2})
+    assert env.variation == {"n_discs": 3, "source": 0, "target": 2}
+
+
+@pytest.mark.parametrize("action", [-1, 6, 1.5, "left"])
+def test_action_out_of_range_is_refused(action: object) -> None:
+    env = HanoiEnv()
+    env.reset()
+    with pytest.raises(ValueError, match="integers from 0 to 5"):
+        env.step(action)  # type: ignore[arg-type]
+
+
+def test_text_shows_discs_source_and_target() -> None:
+    env = HanoiEnv(n_discs=2, render_mode="ansi")
+    env.reset()
+    env.step(ACTION_NAMES.index("move 0->1"))
+    lines = env.render().splitlines()
+    assert lines[-2].split() == ["=====", "===", "|"]
+    assert "source" in lines[-1]
+    assert "target" in lines[-1]
+
+
+def test_picture_shows_the_state() -> None:
+    assert_picture_shows_the_state(gym.make("Hanoi-v0", render_mode="rgb_array"), action=0)
+
+
+def test_window_opens_shows_and_closes(tmp_path: Path) -> None:
+    code = (
+        "import gymnasium as gym, progpolicy_envs, pygame\n"
+        "env = gym.make('Hanoi-v0', render_mode='human'); env.reset(); env.step(0)\n"
+        "assert pygame.display.get_init(); env.close(); assert not pygame.display.get_init()\n"
+    )
+    pytest.importorskip("pygame")
+    environment = {**os.environ, "SDL_VIDEODRIVER": "dummy", "PYTHONPATH": os.pathsep.join(sys.path)}
+    subprocess.run([sys.executable, "-c", code], check=True, env=environment, timeout=60)
+
+
+@pytest.mark.parametrize("n_discs", [1, 12])
+def test_environment_checkers_find_nothing(n_discs: int) -> None:
+    assert_checkers_are_silent("Hanoi-v0", n_discs=n_discs)
+
+
+def test_long_run_of_random_actions() -> None:
+    options = [{"n_discs": n, "source": n % 3, "target": (n + 1) % 3} for n in (1, 2, 3, 5, 12)]
+    assert_long_run_stays_sound("Hanoi-v0", 1_000_000, options)
+
+
+def test_registration_does_not_import_the_environment() -> None:
+    code = "import progpolicy_envs, sys; assert not {'progpolicy_envs.hanoi', 'pybullet', 'torch'} & set(sys.modules)"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    subprocess.run([sys.executable, "-c", code], check=True, env=environment, timeout=60)
+    assert "Hanoi-v0" in progpolicy_envs.DOMAINS
+
+
+def pddl_problem(n_discs: int) -> str:
+    """Write the problem for PDDLGym's Hanoi domain: all discs from the first peg to the third."""
+    discs, pegs = [f"d{disc}" for disc in range(n_discs)], ["p0", "p1", "p2"]
+    places = [*discs, *pegs]
+    facts = [f"(smaller {peg} {disc})" for peg in pegs for disc in discs]
+    facts += [f"(smaller {discs[j]} {discs[i]})" for i in range(n_discs) for j in range(i + 1, n_discs)]
+    facts += [f"(move {disc} {place})" for disc in discs for place in places if disc != place]
+    tower = [*discs, "p0"]
+    facts += [f"(on {upper} {lower})" for upper, lower in pairwise(tower)]
+    facts += ["(clear d0)", "(clear p1)", "(clear p2)"]
+    done = [*discs, "p2"]
+    goal = " ".join(f"(on {upper} {lower})" for upper, lower in pairwise(done))
+    return (
+        f"(define (problem hanoi{n_discs}) (:domain hanoi) (:objects {' '.join(places)})\n"
+        f"(:init {' '.join(facts)})\n(:goal (and {goal})))\n"
+    )
+
+
+@pytest.mark.parametrize("n_discs", [1, 2, 3, 4, 5])
+def test_plan_is_a_valid_plan_in_pddlgym(n_discs: int, tmp_path: Path) -> None:
+    pddlgym = pytest.importorskip("pddlgym", reason="PDDLGym is not installed", exc_type=ImportError)
+    from pddlgym.core import PDDLEnv
+
+    (tmp_path / "problem0.pddl").write_text(pddl_problem(n_discs))
+    domain_file = Path(pddlgym.__file__).parent / "pddl" / "hanoi.pddl"
+    env = PDDLEnv(str(domain_file), str(tmp_path), raise_error_on_invalid_action=True)
+    env.reset()
+    (move,) = env.action_predicates
+    referee, done = Referee(n_discs, 0), False
+    for source, target in planner.plan([0] * n_discs, 2):
+        assert not done
+        referee.move(source, target)
+        pile = referee.piles[target]
+        under = f"d{pile[-2] - 1}" if len(pile) > 1 else f"p{target}"
+        _, _, done, _, _ = env.step(move(f"d{pile[-1] - 1}", under))
+    assert done
+
+
+def test_same_actions_give_the_same_trajectory() -> None:
+    def trajectory() -> list[np.ndarray]:
+        env = HanoiEnv(n_discs=4)
+        env.reset(seed=3)
+        return [env.step(int(action))[0] for action in np.random.default_rng(1).integers(6, size=100)]
+
+    np.testing.assert_array_equal(trajectory(), trajectory())

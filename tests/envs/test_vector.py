@@ -1,0 +1,139 @@
+"""The batched form of every planning domain does what the single form does, step for step."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+Draw = Callable[[np.random.Generator, int], dict[str, Any]]
+
+
+def draw_hanoi(generator: np.random.Generator, num_envs: int) -> dict[str, Any]:
+    pegs = generator.permuted(np.tile(np.arange(3), (num_envs, 1)), axis=1)
+    return {"n_discs": generator.integers(1, 13, num_envs), "source": pegs[:, 0], "target": pegs[:, 1]}
+
+
+CASES: list[tuple[str, dict[str, Any], Draw]] = [
+    ("Hanoi-v0", {}, draw_hanoi),
+]
+NUM_ENVS, LIMIT, STEPS = 64, 37, 90
+
+
+def make_vec(env_id: str, num_envs: int = NUM_ENVS, **arguments: Any) -> gym.vector.VectorEnv:
+    return gym.make_vec(env_id, num_envs=num_envs, vectorization_mode="vector_entry_point", **arguments)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 12345])
+@pytest.mark.parametrize(("env_id", "arguments", "draw"), CASES, ids=lambda case: str(case)[:60])
+def test_batched_equals_single_step_for_step(env_id: str, arguments: dict[str, Any], draw: Draw, seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    batched = make_vec(env_id, max_episode_steps=LIMIT, **arguments)
+    singles = [gym.make(env_id, max_episode_steps=LIMIT, **arguments) for _ in range(NUM_ENVS)]
+    for change in range(4):
+        options = draw(generator, NUM_ENVS) if change else {}
+        row_options = [{name: values[row] for name, values in options.items()} for row in range(NUM_ENVS)]
+        row_seeds = [seed + row if change == 0 else None for row in range(NUM_ENVS)]
+        observations, infos = batched.reset(seed=seed if change == 0 else None, options=options or None)
+        for row, env in enumerate(singles):
+            observation, info = env.reset(seed=row_seeds[row], options=row_options[row])
+            np.testing.assert_array_equal(observations[row], observation)
+            assert infos["variation"][row] == info["variation"]
+            assert infos["optimal_steps"][row] == info["optimal_steps"]
+            assert infos["is_success"][row] == info["is_success"]
+        for _ in range(STEPS):
+            compare_one_step(batched, singles, generator)
+
+
+def compare_one_step(
+    batched: gym.vector.VectorEnv, singles: list[gym.Env[Any, Any]], generator: np.random.Generator
+) -> None:
+    actions = generator.integers(batched.single_action_space.n, size=NUM_ENVS)
+    observations, rewards, terminated, truncated, infos = batched.step(actions)
+    for row, env in enumerate(singles):
+        observation, reward, single_terminated, single_truncated, info = env.step(actions[row])
+        single_truncated = single_truncated and not single_terminated
+        assert (rewards[row], terminated[row], truncated[row]) == (reward, single_terminated, single_truncated)
+        assert infos["is_success"][row] == info["is_success"]
+        if single_terminated or single_truncated:
+            np.testing.assert_array_equal(infos["final_obs"][row], observation)
+            observation, _ = env.reset()
+        np.testing.assert_array_equal(observations[row], observation)
+
+
+@pytest.mark.parametrize(("env_id", "arguments", "draw"), CASES, ids=lambda case: str(case)[:60])
+class TestEveryBatchedForm:
+    def test_spaces_are_those_of_the_single_form(self, env_id: str, arguments: dict[str, Any], draw: Draw) -> None:
+        batched, single = make_vec(env_id, 3, **arguments), gym.make(env_id, **arguments)
+        assert batched.single_observation_space == single.observation_space
+        assert batched.single_action_space == single.action_space
+        assert batched.observation_space.shape == (3, *single.observation_space.shape)
+        assert batched.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+        assert batched.observation_names == single.unwrapped.observation_names
+        assert batched.action_names == single.unwrapped.action_names
+
+    def test_returned_observations_are_not_written_to_later(
+        self, env_id: str, arguments: dict[str, Any], draw: Draw
+    ) -> None:
+        env = make_vec(env_id, **arguments)
+        observations, _ = env.reset(seed=0)
+        copy = observations.copy()
+        for action in range(env.single_action_space.n):
+            env.step(np.full(NUM_ENVS, action))
+        np.testing.assert_array_equal(observations, copy)
+
+    def test_equal_seeds_give_equal_trajectories(self, env_id: str, arguments: dict[str, Any], draw: Draw) -> None:
+        def trajectory() -> list[np.ndarray]:
+            env = make_vec(env_id, max_episode_steps=20, **arguments)
+            env.reset(seed=7, options=draw(np.random.default_rng(5), NUM_ENVS))
+            generator = np.random.default_rng(9)
+            actions = generator.integers(env.single_action_space.n, size=(50, NUM_ENVS))
+            return [env.step(row)[0] for row in actions]
+
+        np.testing.assert_array_equal(trajectory(), trajectory())
+
+    def test_variation_stays_in_force_until_it_is_changed(
+        self, env_id: str, arguments: dict[str, Any], draw: Draw
+    ) -> None:
+        env = make_vec(env_id, **arguments)
+        _, infos = env.reset(seed=0, options=draw(np.random.default_rng(3), NUM_ENVS))
+        _, later = env.reset()
+        assert list(later["variation"]) == list(infos["variation"])
+
+    @pytest.mark.parametrize(
+        ("actions", "message"),
+        [([0, 0], "shape"), ([0, 0, -1], "integers from 0"), ([0, 99, 0], "integers from 0")],
+    )
+    def test_actions_out_of_range_are_refused(
+        self, env_id: str, arguments: dict[str, Any], draw: Draw, actions: list[int], message: str
+    ) -> None:
+        env = make_vec(env_id, 3, **arguments)
+        env.reset(seed=0)
+        with pytest.raises(ValueError, match=message):
+            env.step(np.array(actions))
+
+
+def test_seed_sequence_must_have_one_seed_per_environment() -> None:
+    with pytest.raises(ValueError, match="2 seeds given for 3 environments"):
+        make_vec("Hanoi-v0", 3).reset(seed=[1, 2])
+
+
+def test_option_sequence_must_have_one_value_per_environment() -> None:
+    with pytest.raises(ValueError, match="n_discs: 2 values given for 3 environments"):
+        make_vec("Hanoi-v0", 3).reset(options={"n_discs": [1, 2]})
+
+
+def test_number_of_environments_is_at_least_one() -> None:
+    with pytest.raises(ValueError, match="num_envs=0"):
+        make_vec("Hanoi-v0", 0)
+
+
+def test_refused_variation_leaves_the_old_one_in_force() -> None:
+    env = make_vec("Hanoi-v0", 2, n_discs=2)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"n_discs=13 .* an integer from 1 to 12"):
+        env.reset(options={"n_discs": [3, 13]})
+    _, infos = env.reset()
+    assert [variation["n_discs"] for variation in infos["variation"]] == [2, 2]

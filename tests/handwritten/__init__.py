@@ -1,0 +1,1 @@
+"""Small programs written by hand in our grammar: proof that the policy class can express each domain's solution."""
