@@ -46,8 +46,10 @@ def encode_actions(actions: NDArray[Any], spec: ActionSpec) -> NDArray[np.float3
     if spec.kind in ("box", "multi_binary"):
         return actions.reshape(n_envs, -1).astype(np.float32)
     encoded = np.zeros((n_envs, spec.history_size), dtype=np.float32)
-    offsets = np.concatenate(([0], np.cumsum(spec.sizes)[:-1])) - spec.start
-    np.put_along_axis(encoded, actions.reshape(n_envs, -1).astype(np.int64) + offsets, 1.0, axis=1)
+    columns = actions.reshape(n_envs, -1) - spec.start
+    if len(spec.sizes) > 1:
+        columns = columns + np.concatenate(([0], np.cumsum(spec.sizes)[:-1]))
+    encoded[np.arange(n_envs)[:, None], columns] = 1
     return encoded
 
 

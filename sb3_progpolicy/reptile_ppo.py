@@ -325,15 +325,17 @@ class ReptilePPO(PPO):
     @th.no_grad()
     def _act(self, buffer: RolloutBuffer, step: int) -> np.ndarray:
         """Draw actions ``(n_envs, *action_shape)`` and advance the recurrent states."""
-        obs = obs_as_tensor(self._last_obs, self.device)  # type: ignore[arg-type]
         if self._sampler is not None:
-            features = self.policy.features_extractor(obs).numpy()
+            features = cast(np.ndarray, self._last_obs)
+            if isinstance(self.policy.features_extractor, NormalizingExtractor):
+                features = self.policy.features_extractor(th.as_tensor(features)).numpy()
             hidden, cell = (state[0].numpy() for state in self._program_states())
             actions, hidden, cell = self._sampler.sample(features, hidden, cell, self.reptile.rng)
             if self.recurrent:
                 states = th.from_numpy(hidden)[None], th.from_numpy(cell)[None]
                 self._last_lstm_states = RNNStates(states, states)
             return actions
+        obs = obs_as_tensor(self._last_obs, self.device)  # type: ignore[arg-type]
         if self.recurrent:
             starts = th.zeros(self.n_envs, device=self.device)  # states survive the end of an episode
             drawn, values, log_probs, self._last_lstm_states = self.policy(obs, self._last_lstm_states, starts)

@@ -47,14 +47,16 @@ def check_variation(variation: Variation) -> Variation:
     return variation
 
 
-def _draw_pegs(variation: Variation, rng: np.random.Generator) -> tuple[int, int]:
-    """Return source and target of an episode; those that are ``"random"`` are drawn, never the same peg twice."""
-    pegs: list[int | str] = [variation["source"], variation["target"]]
-    for i, peg in enumerate(pegs):
-        if peg == RANDOM:
-            free = [peg for peg in range(N_PEGS) if peg not in pegs]
-            pegs[i] = free[int(rng.integers(len(free)))]
-    return int(pegs[0]), int(pegs[1])
+def _peg_pairs(variation: Variation) -> list[tuple[int, int]]:
+    """Return the pairs of source and target that a variation allows."""
+    return [
+        pair for pair in MOVES if variation["source"] in (pair[0], RANDOM) and variation["target"] in (pair[1], RANDOM)
+    ]
+
+
+def _draw_pegs(pairs: list[tuple[int, int]], rng: np.random.Generator) -> tuple[int, int]:
+    """Draw source and target of an episode."""
+    return pairs[int(rng.integers(len(pairs)))] if len(pairs) > 1 else pairs[0]
 
 
 class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
@@ -132,7 +134,7 @@ class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
         self.observation_space = _OBSERVATION_SPACE
         self.action_space = spaces.Discrete(len(MOVES))
         self.render_mode = render_mode
-        self.source, self.target = _draw_pegs(self.variation, self.np_random)
+        self.source, self.target = _draw_pegs(_peg_pairs(self.variation), self.np_random)
         self.discs: list[int] = [self.source] * self.variation["n_discs"]
         self._display = Display(self.metadata["render_fps"])
 
@@ -148,7 +150,7 @@ class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
         """
         super().reset(seed=seed)
         self.variation = check_variation(self.variations.update(self.variation, options))
-        self.source, self.target = _draw_pegs(self.variation, self.np_random)
+        self.source, self.target = _draw_pegs(_peg_pairs(self.variation), self.np_random)
         self.discs = [self.source] * self.variation["n_discs"]
         info = {
             "is_success": False,
@@ -300,16 +302,15 @@ class HanoiVectorEnv(PlanningVectorEnv):
     def _read_variations(self) -> None:
         self._n_discs = np.array([variation["n_discs"] for variation in self.row_variations])
         self._full = (1 << self._n_discs) - 1
-        self._random = np.array(
-            [RANDOM in (variation["source"], variation["target"]) for variation in self.row_variations]
-        )
+        self._pairs = [_peg_pairs(variation) for variation in self.row_variations]
+        self._random = np.array([len(pairs) > 1 for pairs in self._pairs])
         self._place_pegs(np.flatnonzero(~self._random))
 
     def _place_pegs(self, rows: NDArray[np.intp]) -> None:
         """Read or draw source and target, and colour the bases with them."""
         if not rows.size:
             return
-        pegs = np.array([_draw_pegs(self.row_variations[row], self._generators[row]) for row in rows])
+        pegs = np.array([_draw_pegs(self._pairs[row], self._generators[row]) for row in rows])
         self._source[rows], self._target[rows] = pegs.T
         continues = (np.arange(N_PEGS) == pegs[:, :1]) | (np.arange(N_PEGS) == pegs[:, 1:])
         self._bases[rows] = ((self._n_discs[rows, None] + ~continues) % 2) @ (1 << np.arange(N_PEGS))

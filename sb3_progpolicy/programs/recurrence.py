@@ -38,112 +38,115 @@ def scan(kind: Cell, gates: th.Tensor, weight_hh: th.Tensor, bias_hh: th.Tensor,
 
 
 class _Scan(th.autograd.Function):
+    """Units come before sequences inside, so that each gate of a step is one contiguous block."""
+
     @staticmethod
     def forward(
-        ctx: FunctionCtx,
-        kind: Cell,
-        gates: th.Tensor,
-        weight: th.Tensor,
-        bias: th.Tensor,
-        hidden: th.Tensor,
+        ctx: FunctionCtx, kind: Cell, gates: th.Tensor, weight: th.Tensor, bias: th.Tensor, hidden: th.Tensor
     ) -> th.Tensor:
         context = cast(Any, ctx)
-        arrays = [tensor.detach().numpy() for tensor in (gates, weight, bias, hidden)]
-        states, tape = _FORWARD[kind](*arrays)
+        by_unit = np.ascontiguousarray(gates.detach().numpy().swapaxes(1, 2))
         # A copy: the optimizer steps the weights in place.
-        context.kind, context.tape, context.states, context.weight = kind, tape, states, arrays[1].copy()
-        return th.from_numpy(states[1:])
+        context.kind, context.weight = kind, weight.detach().numpy().copy()
+        context.states, context.tape = _FORWARD[kind](
+            by_unit, context.weight, bias.detach().numpy()[:, None], hidden.detach().numpy().T
+        )
+        return th.from_numpy(np.ascontiguousarray(context.states[1:].swapaxes(1, 2)))
 
     @staticmethod
     @once_differentiable
     def backward(ctx: FunctionCtx, d_outputs: th.Tensor) -> tuple[th.Tensor | None, ...]:
         context = cast(Any, ctx)
-        backward: Callable[..., tuple[Array, Array]] = _BACKWARD[context.kind]
-        d_gates, d_recurrent = backward(d_outputs.contiguous().numpy(), context.weight, *context.tape)
-        flat = d_recurrent.reshape(-1, d_recurrent.shape[-1])
-        previous = context.states[:-1].reshape(len(flat), -1)
-        return None, th.from_numpy(d_gates), th.from_numpy(flat.T @ previous), th.from_numpy(flat.sum(0)), None
+        d_states = np.ascontiguousarray(d_outputs.numpy().swapaxes(1, 2))
+        d_gates, d_recurrent = _BACKWARD[context.kind](d_states, context.weight.T.copy(), *context.tape)
+        d_weight = np.einsum("tgn,tun->gu", d_recurrent, context.states[:-1], optimize=True)
+        d_bias = d_recurrent.sum((0, 2))
+        d_inputs = np.ascontiguousarray(d_gates.swapaxes(1, 2))
+        return None, th.from_numpy(d_inputs), th.from_numpy(d_weight), th.from_numpy(d_bias), None
 
 
 def _rnn_forward(gates: Array, weight: Array, bias: Array, hidden: Array) -> tuple[Array, Tape]:
     states = np.empty((len(gates) + 1, *hidden.shape), gates.dtype)
-    states[0], weight = hidden, np.ascontiguousarray(weight.T)
-    for t, gate in enumerate(gates):
-        np.tanh(gate + states[t] @ weight, out=states[t + 1])
+    states[0] = hidden
+    for gate, before, after in zip(gates, states[:-1], states[1:], strict=True):
+        np.matmul(weight, before, out=after)
+        after += gate
+        np.tanh(after, out=after)
     return states, (1 - states[1:] ** 2,)
 
 
-def _rnn_backward(d_outputs: Array, weight: Array, slope: Array) -> tuple[Array, Array]:
+def _rnn_backward(d_states: Array, weight: Array, slope: Array) -> tuple[Array, Array]:
     d_gates = np.empty_like(slope)
-    d_hidden = np.zeros_like(d_outputs[0])
+    d_hidden = np.zeros_like(d_states[0])
     for t in reversed(range(len(slope))):
-        np.multiply(d_hidden + d_outputs[t], slope[t], out=d_gates[t])
-        d_hidden = d_gates[t] @ weight
+        d_hidden += d_states[t]
+        np.multiply(d_hidden, slope[t], out=d_gates[t])
+        np.matmul(weight, d_gates[t], out=d_hidden)
     return d_gates, d_gates
 
 
 def _gru_forward(gates: Array, weight: Array, bias: Array, hidden: Array) -> tuple[Array, Tape]:
-    n_steps, n_sequences, width = gates.shape
+    n_steps, width, n_sequences = gates.shape
     units = width // 3
-    states = np.empty((n_steps + 1, n_sequences, units), gates.dtype)
-    reset_update = np.empty((n_steps, n_sequences, 2 * units), gates.dtype)
-    new = np.empty((n_steps, n_sequences, units), gates.dtype)
-    inner = np.empty((n_steps, n_sequences, units), gates.dtype)
-    states[0], weight = hidden, np.ascontiguousarray(weight.T)
-    half = 0.5 * gates[..., : 2 * units]
+    states = np.empty((n_steps + 1, units, n_sequences), gates.dtype)
+    states[0] = hidden
+    # sigmoid(x) = tanh(x / 2) / 2 + 1 / 2: the inner half goes into what is added up.
+    halves = np.repeat(np.array([0.5, 0.5, 1.0], gates.dtype), units)[:, None]
+    weight = weight * halves
+    gates = gates * halves
+    gates[:, : 2 * units] += 0.5 * bias[: 2 * units]
+    reset_update = np.empty((n_steps, 2 * units, n_sequences), gates.dtype)
+    new = np.empty((n_steps, units, n_sequences), gates.dtype)
+    recurrents = np.empty_like(gates)
+    inner = recurrents[:, 2 * units :]
+    inner_bias = bias[2 * units :]
     for t in range(n_steps):
-        recurrent = states[t] @ weight
-        recurrent += bias
-        both = reset_update[t]
-        np.multiply(recurrent[:, : 2 * units], 0.5, out=both)
-        both += half[t]
+        recurrent, both, candidate, before, after = recurrents[t], reset_update[t], new[t], states[t], states[t + 1]
+        np.matmul(weight, before, out=recurrent)
+        np.add(recurrent[: 2 * units], gates[t, : 2 * units], out=both)
         np.tanh(both, out=both)
         both *= 0.5
         both += 0.5
-        inner[t] = recurrent[:, 2 * units :]
-        candidate = new[t]
-        np.multiply(both[:, :units], inner[t], out=candidate)
-        candidate += gates[t, :, 2 * units :]
+        recurrent[2 * units :] += inner_bias
+        np.multiply(both[:units], recurrent[2 * units :], out=candidate)
+        candidate += gates[t, 2 * units :]
         np.tanh(candidate, out=candidate)
-        following = states[t + 1]
-        np.subtract(states[t], candidate, out=following)
-        following *= both[:, units:]
-        following += candidate
+        np.subtract(before, candidate, out=after)
+        after *= both[units:]
+        after += candidate
     return states, (states, reset_update, new, inner)
 
 
 def _gru_backward(
-    d_outputs: Array, weight: Array, states: Array, reset_update: Array, new: Array, inner: Array
+    d_states: Array, weight: Array, states: Array, reset_update: Array, new: Array, inner: Array
 ) -> tuple[Array, Array]:
-    units = new.shape[-1]
-    reset, update = reset_update[..., :units], reset_update[..., units:]
+    units = new.shape[1]
+    reset, update = reset_update[:, :units], reset_update[:, units:]
     # Derivatives of each step that do not depend on the steps after it, for all steps at once.
     by_new = (1 - update) * (1 - new**2)
     by_update = (states[:-1] - new) * update * (1 - update)
     by_reset = inner * reset * (1 - reset)
-    update = np.ascontiguousarray(update)
-    d_gates = np.empty((*new.shape[:-1], 3 * units), new.dtype)
-    d_recurrent = np.empty_like(d_gates)
+    # What the step's candidate and gates pass on, per unit of d_hidden: by_new[t] times these three.
+    by_hidden = np.concatenate((by_new * by_reset, by_update, by_new * reset), axis=1)
+    by_hidden = by_hidden.reshape(len(new), 3, units, -1)
+    d_recurrent = np.empty_like(by_hidden)
+    flat = d_recurrent.reshape(len(new), 3 * units, -1)
+    d_hiddens = np.empty_like(new)
     d_hidden = np.zeros_like(new[0])
+    through = np.empty_like(d_hidden)
     for t in reversed(range(len(new))):
-        d_hidden += d_outputs[t]
-        row = d_recurrent[t]
-        d_new = d_hidden * by_new[t]
-        np.multiply(d_new, by_reset[t], out=row[:, :units])
-        np.multiply(d_hidden, by_update[t], out=row[:, units : 2 * units])
-        np.multiply(d_new, reset[t], out=row[:, 2 * units :])
-        d_gates[t, :, 2 * units :] = d_new
-        d_hidden *= update[t]
-        d_hidden += row @ weight
-    d_gates[..., : 2 * units] = d_recurrent[..., : 2 * units]
-    return d_gates, d_recurrent
+        np.add(d_hidden, d_states[t], out=d_hiddens[t])
+        np.multiply(d_hiddens[t], by_hidden[t], out=d_recurrent[t])
+        np.matmul(weight, flat[t], out=d_hidden)
+        np.multiply(d_hiddens[t], update[t], out=through)
+        d_hidden += through
+    d_gates = flat.copy()
+    np.multiply(d_hiddens, by_new, out=d_gates[:, 2 * units :])
+    return d_gates, flat
 
 
-_FORWARD: dict[Cell, Callable[..., tuple[Array, Tape]]] = {
+_FORWARD: dict[Cell, Callable[[Array, Array, Array, Array], tuple[Array, Tape]]] = {
     "rnn": _rnn_forward,
     "gru": _gru_forward,
 }
-_BACKWARD: dict[Cell, Callable[..., tuple[Array, Array]]] = {
-    "rnn": _rnn_backward,
-    "gru": _gru_backward,
-}
+_BACKWARD: dict[Cell, Callable[..., tuple[Array, Array]]] = {"rnn": _rnn_backward, "gru": _gru_backward}

@@ -30,34 +30,38 @@ class ProgramSampler:
             self._probabilities = _view(module.search.probabilities())
         self._scale = 1 / float(module.temperature)
         self._n_controllers = module.n_controllers
-        self._controllers = _view(module.controllers.weight).T, _view(module.controllers.bias)
         self._std = None if log_std is None else np.exp(_view(log_std))
         self.recurrent = conditions.recurrent
+        # Everything that is affine in X in one product: the gates of the conditions, then the controllers.
         if self.recurrent:
             rnn = conditions.rnn
-            parameters = (rnn.weight_ih_l0, rnn.bias_ih_l0, rnn.weight_hh_l0, rnn.bias_hh_l0)
-            input_weight, self._input_bias, weight, self._bias = (_view(value) for value in parameters)  # type: ignore[arg-type]
-            # Copies: a contiguous transpose is faster to multiply by than a strided one.
-            self._input_weight, self._weight = (np.ascontiguousarray(matrix.T) for matrix in (input_weight, weight))
+            names = ("weight_ih_l0", "bias_ih_l0", "weight_hh_l0", "bias_hh_l0")
+            input_weight, input_bias, weight, self._bias = (_view(getattr(rnn, name)) for name in names)
+            self._weight = np.ascontiguousarray(weight.T)
             self._readout, self._readout_bias = _view(conditions.readout), _view(conditions.readout_bias)
         elif self.n_conditions:
-            self._affine = _view(conditions.affine.weight).T, _view(conditions.affine.bias)
+            input_weight, input_bias = _view(conditions.affine.weight), _view(conditions.affine.bias)
+        else:
+            input_weight, input_bias = np.zeros((0, module.n_inputs), np.float32), np.zeros(0, np.float32)
+        self._n_gates = len(input_bias)
+        controllers = module.controllers
+        self._affine = np.ascontiguousarray(np.concatenate((input_weight, _view(controllers.weight))).T)
+        self._constant = np.concatenate((input_bias, _view(controllers.bias)))
+        self._edges = np.cumsum(self.action.sizes)[:-1]
 
-    def tests(self, inputs: Array, hidden: Array, cell: Array) -> tuple[Array, Array, Array]:
+    def tests(self, gates: Array, hidden: Array, cell: Array) -> tuple[Array, Array, Array]:
         """Return the values of B ``(n_envs, n_conditions)`` and the new states.
 
-        :param inputs: X, ``(n_envs, n_inputs)``
+        :param gates: the affine part of the conditions, ``(n_envs, n_gates * hidden_size)``
         :param hidden: ``(n_envs, hidden_size)``
         :param cell: ``(n_envs, hidden_size)``, used by LSTM conditions
         """
-        if not self.n_conditions:
-            return np.zeros((len(inputs), 0), dtype=np.float32), hidden, cell
         if not self.recurrent:
-            weight, bias = self._affine
-            return inputs @ weight + bias, hidden, cell
-        gates = inputs @ self._input_weight + self._input_bias
+            return gates, hidden, cell
         hidden, cell = STEPS[self.cell](gates, hidden @ self._weight + self._bias, hidden, cell)
-        units = hidden.reshape(len(inputs), self.n_conditions, self.size)
+        if self.size == 1:
+            return hidden * self._readout[:, 0] + self._readout_bias, hidden, cell
+        units = hidden.reshape(len(gates), self.n_conditions, self.size)
         return (units * self._readout).sum(-1) + self._readout_bias, hidden, cell
 
     def masses(self, tests: Array) -> Array:
@@ -79,28 +83,35 @@ class ProgramSampler:
         :param rng: source of all randomness
         :return: actions ``(n_envs, *action_shape)`` (Discrete without ``start``, Box flat and unclipped), new states
         """
-        tests, hidden, cell = self.tests(inputs, hidden, cell)
-        masses = self.masses(tests)[:, :, None]
-        weight, bias = self._controllers
-        outputs = (inputs @ weight + bias).reshape(len(inputs), self._n_controllers, -1)
+        affine = inputs @ self._affine + self._constant
+        tests, hidden, cell = self.tests(affine[:, : self._n_gates], hidden, cell)
+        masses = self.masses(tests)
+        outputs = affine[:, self._n_gates :].reshape(len(inputs), self._n_controllers, -1)
         if self.action.kind == "box":
-            mean = (masses * outputs).sum(1)
+            mean = (masses[:, :, None] * outputs).sum(1)
             return mean + self._std * rng.standard_normal(mean.shape, dtype=np.float32), hidden, cell
         if self.action.kind == "multi_binary":
-            probabilities = (masses * sigmoid(outputs)).sum(1)
+            probabilities = (masses[:, :, None] * sigmoid(outputs)).sum(1)
             return (rng.random(probabilities.shape) < probabilities).astype(np.int8), hidden, cell
-        edges = np.cumsum(self.action.sizes)[:-1]
-        drawn = [_draw(masses, component, rng) for component in np.split(outputs, edges, axis=2)]
-        return drawn[0] if self.action.kind == "discrete" else np.stack(drawn, axis=1), hidden, cell
+        if self.action.kind == "discrete":
+            return _draw(masses, outputs, rng), hidden, cell
+        drawn = [_draw(masses, component, rng) for component in np.split(outputs, self._edges, axis=2)]
+        return np.stack(drawn, axis=1), hidden, cell
 
 
 def _draw(masses: Array, outputs: Array, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Sample from the mixture of softmaxes of ``outputs`` ``(n_envs, n_controllers, n_choices)``."""
-    odds = np.exp(outputs - outputs.max(2, keepdims=True))
-    probabilities = (odds * (masses / odds.sum(2, keepdims=True))).sum(1)
-    edges = np.cumsum(probabilities, axis=1)
-    draws = rng.random((len(edges), 1)) * edges[:, -1:]
-    return np.minimum((edges <= draws).sum(1), edges.shape[1] - 1)
+    """Sample from the mixture of softmaxes: first a controller by its mass, then an action by its softmax.
+
+    :param masses: ``(n_envs, n_controllers)``
+    :param outputs: ``(n_envs, n_controllers, n_choices)``
+    """
+    rows = np.arange(len(masses))
+    edges = masses.cumsum(1)
+    # The last edge is left out, so that rounding cannot lead past the last controller.
+    controllers = (edges[:, :-1] <= rng.random((len(rows), 1))).sum(1)
+    chosen = outputs[rows, controllers]
+    # Adding Gumbel noise to the logits and taking the largest is sampling from their softmax.
+    return (chosen - np.log(rng.standard_exponential(chosen.shape))).argmax(1)
 
 
 def _view(tensor: th.Tensor) -> Array:
