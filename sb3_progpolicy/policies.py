@@ -39,6 +39,8 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
     :param net_arch: hidden layers of the critic
     :param activation_fn: of the critic
     :param log_std_init: initial logarithm of the standard deviation of Box actions
+    :param optimizer_class: of the inner updates
+    :param optimizer_kwargs: of the optimizer; for Adam ``eps=1e-5`` and the fused kernel by default
     :param reset_state_at_episode_start: zero the conditions' states when an episode starts; by default they survive
         it, and only the caller's ``state=None`` (or a task switch in ``ReptilePPO``) zeroes them (section 2.4)
     :param kwargs: further arguments of SB3's ``ActorCriticPolicy``
@@ -55,8 +57,10 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
         condition_size: int = 1,
         temperature: float = 1.0,
         net_arch: list[int] | None = None,
-        activation_fn: type[nn.Module] = nn.Tanh,
+        activation_fn: type[nn.Module] = nn.ReLU,
         log_std_init: float = 0.0,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
         reset_state_at_episode_start: bool = False,
         **kwargs: Any,
     ) -> None:
@@ -77,6 +81,9 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
         }
         self.spec_of_actions: ActionSpec = action_spec(action_space)
         self.reset_state_at_episode_start = reset_state_at_episode_start
+        if optimizer_kwargs is None and optimizer_class is th.optim.Adam:
+            # SB3's epsilon for PPO, and one kernel for all parameters.
+            optimizer_kwargs = {"eps": 1e-5, "fused": True}
         # Past RecurrentActorCriticPolicy's own constructor, which would build two LSTMs that no program uses.
         ActorCriticPolicy.__init__(
             self,
@@ -86,6 +93,8 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
             net_arch={"pi": [], "vf": [64, 64] if net_arch is None else net_arch},
             activation_fn=activation_fn,
             log_std_init=log_std_init,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
             **kwargs,
         )
 

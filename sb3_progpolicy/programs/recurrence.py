@@ -90,29 +90,40 @@ def _gru_forward(gates: Array, weight: Array, bias: Array, hidden: Array) -> tup
     units = width // 3
     states = np.empty((n_steps + 1, units, n_sequences), gates.dtype)
     states[0] = hidden
+    inner_bias = bias[2 * units :]
     # sigmoid(x) = tanh(x / 2) / 2 + 1 / 2: the inner half goes into what is added up.
     halves = np.repeat(np.array([0.5, 0.5, 1.0], gates.dtype), units)[:, None]
     weight = weight * halves
     gates = gates * halves
     gates[:, : 2 * units] += 0.5 * bias[: 2 * units]
+    to_gates, to_new = np.split(weight, [2 * units])
     reset_update = np.empty((n_steps, 2 * units, n_sequences), gates.dtype)
-    new = np.empty((n_steps, units, n_sequences), gates.dtype)
-    recurrents = np.empty_like(gates)
-    inner = recurrents[:, 2 * units :]
-    inner_bias = bias[2 * units :]
-    for t in range(n_steps):
-        recurrent, both, candidate, before, after = recurrents[t], reset_update[t], new[t], states[t], states[t + 1]
-        np.matmul(weight, before, out=recurrent)
-        np.add(recurrent[: 2 * units], gates[t, : 2 * units], out=both)
+    new, inner = (np.empty((n_steps, units, n_sequences), gates.dtype) for _ in range(2))
+    rows = zip(
+        gates[:, : 2 * units],
+        gates[:, 2 * units :],
+        reset_update,
+        reset_update[:, :units],
+        reset_update[:, units:],
+        inner,
+        new,
+        states[:-1],
+        states[1:],
+        strict=True,
+    )
+    for gate, gate_new, both, reset, update, recurrent, candidate, before, after in rows:
+        np.matmul(to_gates, before, out=both)
+        both += gate
         np.tanh(both, out=both)
         both *= 0.5
         both += 0.5
-        recurrent[2 * units :] += inner_bias
-        np.multiply(both[:units], recurrent[2 * units :], out=candidate)
-        candidate += gates[t, 2 * units :]
+        np.matmul(to_new, before, out=recurrent)
+        recurrent += inner_bias
+        np.multiply(reset, recurrent, out=candidate)
+        candidate += gate_new
         np.tanh(candidate, out=candidate)
         np.subtract(before, candidate, out=after)
-        after *= both[units:]
+        after *= update
         after += candidate
     return states, (states, reset_update, new, inner)
 
@@ -134,11 +145,14 @@ def _gru_backward(
     d_hiddens = np.empty_like(new)
     d_hidden = np.zeros_like(new[0])
     through = np.empty_like(d_hidden)
-    for t in reversed(range(len(new))):
-        np.add(d_hidden, d_states[t], out=d_hiddens[t])
-        np.multiply(d_hiddens[t], by_hidden[t], out=d_recurrent[t])
-        np.matmul(weight, flat[t], out=d_hidden)
-        np.multiply(d_hiddens[t], update[t], out=through)
+    rows = zip(
+        d_states[::-1], d_hiddens[::-1], by_hidden[::-1], d_recurrent[::-1], flat[::-1], update[::-1], strict=True
+    )
+    for d_state, d_total, factors, row, flat_row, kept in rows:
+        np.add(d_hidden, d_state, out=d_total)
+        np.multiply(d_total, factors, out=row)
+        np.matmul(weight, flat_row, out=d_hidden)
+        np.multiply(d_total, kept, out=through)
         d_hidden += through
     d_gates = flat.copy()
     np.multiply(d_hiddens, by_new, out=d_gates[:, 2 * units :])
