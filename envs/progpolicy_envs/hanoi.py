@@ -16,11 +16,12 @@ from progpolicy_envs.vector import PlanningVectorEnv
 
 MAX_DISCS = 12
 N_PEGS = 3
+RANDOM = "random"
 MOVES: tuple[tuple[int, int], ...] = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 VARIATIONS = VariationSpace(
     IntParameter("n_discs", 1, MAX_DISCS, "number of discs"),
-    IntParameter("source", 0, N_PEGS - 1, "peg on which all discs start"),
-    IntParameter("target", 0, N_PEGS - 1, "peg to which all discs go; not the source"),
+    IntParameter("source", 0, N_PEGS - 1, "peg on which all discs start", (RANDOM,)),
+    IntParameter("target", 0, N_PEGS - 1, "peg to which all discs go; not the source", (RANDOM,)),
 )
 _N_TOPS = MAX_DISCS + 1  # a peg's top disc, or none
 STEP_REWARD, ILLEGAL_REWARD, GOAL_REWARD = -0.01, -0.05, 1.0
@@ -38,12 +39,24 @@ def check_variation(variation: Variation) -> Variation:
     :param variation: values of ``n_discs``, ``source`` and ``target``, each in its range
     :raises ValueError: if source and target are the same peg
     """
-    if variation["source"] == variation["target"]:
+    if variation["source"] == variation["target"] != RANDOM:
         raise ValueError(
             f"source={variation['source']} and target={variation['target']} are not accepted together; "
-            "they are two different pegs from 0 to 2"
+            "they are two different pegs from 0 to 2, or 'random'"
         )
     return variation
+
+
+def _peg_pairs(variation: Variation) -> list[tuple[int, int]]:
+    """Return the pairs of source and target that a variation allows."""
+    return [
+        pair for pair in MOVES if variation["source"] in (pair[0], RANDOM) and variation["target"] in (pair[1], RANDOM)
+    ]
+
+
+def _draw_pegs(pairs: list[tuple[int, int]], rng: np.random.Generator) -> tuple[int, int]:
+    """Draw source and target of an episode."""
+    return pairs[int(rng.integers(len(pairs)))] if len(pairs) > 1 else pairs[0]
 
 
 class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
@@ -81,7 +94,8 @@ class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
     -0.01 a step, a further -0.05 for an illegal move, +1 when the last disc reaches the target.
 
     ## Starting State
-    All discs on the source peg. There is nothing random.
+    All discs on the source peg. Source and target are fixed, or drawn anew for each episode where they are
+    ``"random"``, which shows a policy the same puzzle from all sides.
 
     ## Episode End
     Terminated when all discs lie on the target peg; truncated after 500 steps (``max_episode_steps``).
@@ -93,11 +107,11 @@ class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
     ``gym.make("Hanoi-v0", n_discs=5)`` or ``env.reset(options={"n_discs": 5})``; an option stays in force until it
     is changed. Values that are not accepted raise ``ValueError``.
 
-    | Parameter  | Values  | Default | Meaning                                   |
-    |------------|---------|---------|-------------------------------------------|
-    | n_discs    | 1 to 12 | 3       | number of discs                           |
-    | source     | 0 to 2  | 0       | peg on which all discs start              |
-    | target     | 0 to 2  | 2       | peg to which all discs go; not the source |
+    | Parameter  | Values             | Default | Meaning                                   |
+    |------------|--------------------|---------|-------------------------------------------|
+    | n_discs    | 1 to 12            | 3       | number of discs                           |
+    | source     | 0 to 2, `"random"` | 0       | peg on which all discs start              |
+    | target     | 0 to 2, `"random"` | 2       | peg to which all discs go; not the source |
 
     ## References
     The domain `hanoi` of PDDLGym (Silver and Chitnis, 2020); E. Lucas, *Récréations mathématiques* III (1893).
@@ -111,14 +125,17 @@ class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
     observation_names: ClassVar[tuple[str, ...]] = OBSERVATION_NAMES
     action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
 
-    def __init__(self, n_discs: int = 3, source: int = 0, target: int = 2, render_mode: str | None = None) -> None:
+    def __init__(
+        self, n_discs: int = 3, source: int | str = 0, target: int | str = 2, render_mode: str | None = None
+    ) -> None:
         self.variation = check_variation(
             self.variations.update({}, {"n_discs": n_discs, "source": source, "target": target})
         )
         self.observation_space = _OBSERVATION_SPACE
         self.action_space = spaces.Discrete(len(MOVES))
         self.render_mode = render_mode
-        self.discs: list[int] = [self.variation["source"]] * self.variation["n_discs"]
+        self.source, self.target = _draw_pegs(_peg_pairs(self.variation), self.np_random)
+        self.discs: list[int] = [self.source] * self.variation["n_discs"]
         self._display = Display(self.metadata["render_fps"])
 
     def reset(
@@ -126,18 +143,19 @@ class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Put all discs onto the source peg.
 
-        :param seed: seeds the generator; nothing in this environment draws from it
+        :param seed: seeds the generator from which random pegs are drawn
         :param options: new values of variation parameters; they stay in force
         :return: observation ``(9,)`` and info
         :raises ValueError: if a variation is not accepted; the variation in force is then unchanged
         """
         super().reset(seed=seed)
         self.variation = check_variation(self.variations.update(self.variation, options))
-        self.discs = [self.variation["source"]] * self.variation["n_discs"]
+        self.source, self.target = _draw_pegs(_peg_pairs(self.variation), self.np_random)
+        self.discs = [self.source] * self.variation["n_discs"]
         info = {
             "is_success": False,
             "variation": dict(self.variation),
-            "optimal_steps": planner.optimal_steps(self.discs, self.variation["target"]),
+            "optimal_steps": planner.optimal_steps(self.discs, self.target),
         }
         self._show()
         return self._observe(), info
@@ -158,7 +176,7 @@ class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
             self.discs[tops[source]] = target
         else:
             reward += ILLEGAL_REWARD
-        solved = all(peg == self.variation["target"] for peg in self.discs)
+        solved = all(peg == self.target for peg in self.discs)
         reward += GOAL_REWARD * solved
         self._show()
         return self._observe(), reward, solved, False, {"is_success": solved}
@@ -189,7 +207,7 @@ class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
         observation = np.empty((N_PEGS, 3), dtype=np.float32)
         for peg, top in enumerate(tops):
             empty = top == n_discs
-            continues = peg in (self.variation["source"], self.variation["target"])
+            continues = peg in (self.source, self.target)
             shade = top + (empty and not continues)
             observation[peg] = (sum((top > other) - (top < other) for other in tops) / 2, 2 * (shade % 2) - 1, empty)
         return observation.reshape(-1)
@@ -199,7 +217,7 @@ class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
             self._display.show(self._frame())
 
     def _frame(self) -> NDArray[np.uint8]:
-        return hanoi_frame(self.discs, self.variation["source"], self.variation["target"])
+        return hanoi_frame(self.discs, self.source, self.target)
 
     def _text(self) -> str:
         n_discs = len(self.discs)
@@ -212,7 +230,7 @@ class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
                 disc = stack[len(stack) - 1 - level] if level < len(stack) else None
                 cells.append(("|" if disc is None else "=" * (2 * disc + 3)).center(width))
             rows.append(" ".join(cells).rstrip())
-        names = {self.variation["source"]: "source", self.variation["target"]: "target"}
+        names = {self.source: "source", self.target: "target"}
         base = " ".join(f"{peg} {names.get(peg, '')}".strip().center(width, "-") for peg in range(N_PEGS))
         return "\n".join([*rows, base]) + "\n"
 
@@ -259,8 +277,8 @@ class HanoiVectorEnv(PlanningVectorEnv):
         self,
         num_envs: int = 1,
         n_discs: int = 3,
-        source: int = 0,
-        target: int = 2,
+        source: int | str = 0,
+        target: int | str = 2,
         max_episode_steps: int | None = None,
     ) -> None:
         variation = self.variations.update({}, {"n_discs": n_discs, "source": source, "target": target})
@@ -269,10 +287,12 @@ class HanoiVectorEnv(PlanningVectorEnv):
         )
         self._bits = np.zeros((num_envs, N_PEGS), dtype=np.int64)
         self._tops = np.zeros((num_envs, N_PEGS), dtype=np.int64)
+        self._n_discs = np.zeros(num_envs, dtype=np.int64)
         self._full = np.zeros(num_envs, dtype=np.int64)
         self._source = np.zeros(num_envs, dtype=np.int64)
         self._target = np.zeros(num_envs, dtype=np.int64)
         self._bases = np.zeros(num_envs, dtype=np.int64)
+        self._random = np.zeros(num_envs, dtype=bool)
         self._read_variations()
 
     def _set_variations(self, options: Any) -> None:
@@ -280,15 +300,23 @@ class HanoiVectorEnv(PlanningVectorEnv):
         self._read_variations()
 
     def _read_variations(self) -> None:
-        n_discs, self._source, self._target = (
-            np.array([variation[name] for variation in self.row_variations]) for name in self.variations
-        )
-        self._full = (1 << n_discs) - 1
-        pegs = np.arange(N_PEGS)
-        continues = (pegs == self._source[:, None]) | (pegs == self._target[:, None])
-        self._bases = ((n_discs[:, None] + ~continues) % 2) @ (1 << pegs)
+        self._n_discs = np.array([variation["n_discs"] for variation in self.row_variations])
+        self._full = (1 << self._n_discs) - 1
+        self._pairs = [_peg_pairs(variation) for variation in self.row_variations]
+        self._random = np.array([len(pairs) > 1 for pairs in self._pairs])
+        self._place_pegs(np.flatnonzero(~self._random))
+
+    def _place_pegs(self, rows: NDArray[np.intp]) -> None:
+        """Read or draw source and target, and colour the bases with them."""
+        if not rows.size:
+            return
+        pegs = np.array([_draw_pegs(self._pairs[row], self._generators[row]) for row in rows])
+        self._source[rows], self._target[rows] = pegs.T
+        continues = (np.arange(N_PEGS) == pegs[:, :1]) | (np.arange(N_PEGS) == pegs[:, 1:])
+        self._bases[rows] = ((self._n_discs[rows, None] + ~continues) % 2) @ (1 << np.arange(N_PEGS))
 
     def _reset_rows(self, rows: NDArray[np.intp]) -> None:
+        self._place_pegs(rows[self._random[rows]])
         self._bits[rows] = 0
         self._bits[rows, self._source[rows]] = self._full[rows]
         self._tops[rows] = self._TOP[self._bits[rows]]

@@ -13,24 +13,27 @@ Variation = dict[str, Any]
 
 @dataclass(frozen=True)
 class IntParameter:
-    """A whole number between ``low`` and ``high``, both included."""
+    """A whole number between ``low`` and ``high``, both included, or one of the ``names``."""
 
     name: str
     low: int
     high: int
     description: str
+    names: tuple[str, ...] = ()
 
     @property
     def allowed(self) -> str:
         """The accepted values in words."""
-        return f"an integer from {self.low} to {self.high}"
+        return " or ".join((f"an integer from {self.low} to {self.high}", *map(repr, self.names)))
 
-    def parse(self, value: Any) -> int:
-        """Return ``value`` as an ``int``.
+    def parse(self, value: Any) -> int | str:
+        """Return ``value`` as an ``int``, or the name.
 
-        :param value: any integral number (NumPy integers included, booleans not)
+        :param value: any integral number (NumPy integers included, booleans not), or one of ``names``
         :raises ValueError: if it is of another type or out of range
         """
+        if isinstance(value, str) and value in self.names:
+            return str(value)
         if isinstance(value, bool) or not isinstance(value, Integral) or not self.low <= int(value) <= self.high:
             raise ValueError(f"{self.name}={value!r} is not accepted; {self.name} is {self.allowed}")
         return int(value)

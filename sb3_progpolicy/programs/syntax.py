@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -148,6 +149,25 @@ class Program:
         if isinstance(last, IfThenElse):
             raise TypeError("a program ends in a controller")
         return (*(branch.then for branch in branches), last)
+
+    def __str__(self) -> str:
+        """The program as :func:`~sb3_progpolicy.programs.export.export_text` prints it."""
+        from sb3_progpolicy.programs.export import export_text
+
+        return export_text(self)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the program to a JSON file, see :func:`~sb3_progpolicy.programs.io.save_program`."""
+        from sb3_progpolicy.programs.io import save_program
+
+        save_program(self, path)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Program:
+        """Read a program from a JSON file, see :func:`~sb3_progpolicy.programs.io.load_program`."""
+        from sb3_progpolicy.programs.io import load_program
+
+        return load_program(path)
 
     def _branches(self) -> Iterator[IfThenElse]:
         expression = self.body

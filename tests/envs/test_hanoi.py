@@ -21,7 +21,7 @@ from tests.envs.helpers import (
     assert_window_opens_shows_and_closes,
     run_python,
 )
-from tests.handwritten.evaluate import CrispPolicy, play, size_of
+from tests.handwritten.evaluate import Player, play, play_batch, size_of
 from tests.handwritten.hanoi import hanoi_program
 
 
@@ -124,21 +124,41 @@ def test_observation_is_what_the_docstring_says() -> None:
 def test_handwritten_controller_is_optimal_on_training_and_unseen_variations(n_discs: int) -> None:
     program = hanoi_program()
     assert size_of(program) == (0, 1)
-    env = gym.make("Hanoi-v0", max_episode_steps=2**10)
-    for source, target in permutations(range(3), 2):
-        episode = play(program, env, n_discs=n_discs, source=source, target=target)
-        assert episode.success
-        assert episode.steps == episode.optimal == 2**n_discs - 1
+    episodes = play_batch(program, "Hanoi-v0", 24, 2**10, n_discs=n_discs, source="random", target="random")
+    assert all(episode.success for episode in episodes)
+    assert {episode.steps for episode in episodes} == {episode.optimal for episode in episodes} == {2**n_discs - 1}
 
 
 def test_handwritten_controller_stays_optimal_when_its_history_survives_episodes() -> None:
-    policy = CrispPolicy(hanoi_program())
+    policy = Player(hanoi_program())
     env = gym.make("Hanoi-v0", n_discs=4)
     assert [play(policy, env).steps for _ in range(4)] == [15] * 4
 
 
+@pytest.mark.parametrize(
+    ("source", "target", "pairs"),
+    [
+        ("random", "random", set(permutations(range(3), 2))),
+        (1, "random", {(1, 0), (1, 2)}),
+        ("random", 0, {(1, 0), (2, 0)}),
+    ],
+)
+def test_random_pegs_are_drawn_anew_for_each_episode(
+    source: int | str, target: int | str, pairs: set[tuple[int, int]]
+) -> None:
+    env = HanoiEnv(n_discs=2, source=source, target=target)
+    drawn = set()
+    for episode in range(60):
+        _, info = env.reset(seed=3 if episode == 0 else None)
+        assert info["variation"] == {"n_discs": 2, "source": source, "target": target}
+        drawn.add((env.source, env.target))
+        moves = list(planner.plan(env.discs, env.target))
+        assert [env.step(MOVES.index(move))[2] for move in moves] == [False, False, True]
+    assert drawn == pairs
+
+
 def test_source_and_target_must_differ() -> None:
-    with pytest.raises(ValueError, match=r"source=1 and target=1 .* two different pegs from 0 to 2"):
+    with pytest.raises(ValueError, match=r"source=1 and target=1 .* two different pegs from 0 to 2, or 'random'"):
         HanoiEnv(source=1, target=1)
     env = HanoiEnv(source=0, target=2)
     with pytest.raises(ValueError, match="source=2 and target=2"):

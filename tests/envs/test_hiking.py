@@ -20,7 +20,7 @@ from tests.envs.helpers import (
     assert_resets_hold_no_memory,
     assert_window_opens_shows_and_closes,
 )
-from tests.handwritten.evaluate import CrispPolicy, play, size_of
+from tests.handwritten.evaluate import Player, play, play_batch, size_of
 from tests.handwritten.hiking import egocentric_program, map_program, turns
 
 NORTH, EAST, SOUTH, WEST = range(4)
@@ -202,8 +202,7 @@ def test_directions_are_clockwise_and_north_is_up() -> None:
 def test_handwritten_egocentric_program_collects_all_stars_on_every_map(layout: str, n_stars: int) -> None:
     program = egocentric_program()
     assert size_of(program) == (0, 1)
-    env = gym.make("Hiking-v0", observation="egocentric", layout=layout)
-    episodes = [play(program, env, seed=seed, n_stars=n_stars) for seed in range(25)]
+    episodes = play_batch(program, "Hiking-v0", 100, observation="egocentric", layout=layout, n_stars=n_stars)
     assert all(episode.success for episode in episodes)
     assert all(episode.steps >= episode.optimal for episode in episodes)
     # Without a map of the stars a round trip is the best one can do; it costs little when there are many.
@@ -215,8 +214,7 @@ def test_handwritten_egocentric_program_collects_all_stars_on_every_map(layout: 
 def test_handwritten_map_program_solves_training_and_unseen_variations(n_stars: int) -> None:
     program = map_program("valley")
     assert size_of(program) == (3, 4)
-    env = gym.make("Hiking-v0", observation="map", layout="valley")
-    episodes = [play(program, env, seed=seed, n_stars=n_stars) for seed in range(50)]
+    episodes = play_batch(program, "Hiking-v0", 100, observation="map", layout="valley", n_stars=n_stars)
     assert all(episode.success for episode in episodes)
     round_trip = 2 * int(LAYOUTS["valley"].is_path.sum() - 1)
     assert all(episode.optimal <= episode.steps <= round_trip for episode in episodes)
@@ -229,7 +227,7 @@ def test_handwritten_map_program_solves_training_and_unseen_variations(n_stars: 
 def test_handwritten_programs_go_on_when_their_history_survives_episodes(
     observation: str, layout: str, program: Program
 ) -> None:
-    policy = CrispPolicy(program)
+    policy = Player(program)
     env = gym.make("Hiking-v0", observation=observation, layout=layout)
     assert all(play(policy, env, seed=seed, n_stars=1 + seed % 10).success for seed in range(30))
 

@@ -17,7 +17,7 @@ from tests.envs.helpers import (
     assert_resets_hold_no_memory,
     assert_window_opens_shows_and_closes,
 )
-from tests.handwritten.evaluate import CrispPolicy, play, size_of
+from tests.handwritten.evaluate import Player, play, play_batch, size_of
 from tests.handwritten.stacking import stacking_program
 
 NORTH, EAST, SOUTH, WEST, PICK = range(5)
@@ -129,14 +129,13 @@ def assert_observation_shows(observation: np.ndarray, referee: Referee, n_plates
 def test_handwritten_program_is_optimal_on_training_and_unseen_variations(n_plates: int) -> None:
     program = stacking_program()
     assert size_of(program) == (4, 5)
-    env = gym.make("Stacking-v0", n_plates=n_plates)
-    episodes = [play(program, env, seed=seed) for seed in range(60)]
+    episodes = play_batch(program, "Stacking-v0", 100, n_plates=n_plates)
     assert all(episode.success for episode in episodes)
     assert [episode.steps for episode in episodes] == [episode.optimal for episode in episodes]
 
 
 def test_handwritten_program_stays_optimal_when_its_history_survives_episodes() -> None:
-    policy, env = CrispPolicy(stacking_program()), gym.make("Stacking-v0")
+    policy, env = Player(stacking_program()), gym.make("Stacking-v0")
     episodes = [play(policy, env, seed=seed, n_plates=1 + seed % 8) for seed in range(16)]
     assert [episode.steps for episode in episodes] == [episode.optimal for episode in episodes]
 

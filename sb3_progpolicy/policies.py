@@ -1,0 +1,308 @@
+"""Programmatic policies for SB3: the actor is a program, the critic a small network."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, cast
+
+import torch as th
+from gymnasium import spaces
+from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
+from sb3_contrib.common.recurrent.type_aliases import RNNStates
+from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import MlpExtractor
+from stable_baselines3.common.type_aliases import Schedule
+from torch import nn
+
+from sb3_progpolicy.interaction import action_spec
+from sb3_progpolicy.normalization import NormalizingExtractor
+from sb3_progpolicy.programs.modules import Conditions, ProgramModule, State
+from sb3_progpolicy.programs.syntax import ActionSpec, Cell, Program
+
+# W is one number per layer and has few updates to decide in, so that it takes larger steps than the controllers.
+DERIVATION_LR_SCALE = 10.0
+
+
+class ProgrammaticActorCritic(ActorCriticPolicy):
+    """What both programmatic policies share: the program as the actor and an MLP on the same features as the critic.
+
+    Programs read one-dimensional Box observations and act in Discrete, Box, MultiDiscrete and MultiBinary spaces.
+
+    :param observation_space: of the environment, with the interaction history if it is appended
+    :param action_space: of the environment
+    :param lr_schedule: learning rate schedule
+    :param depth: layers of the derivation graph, at least 1; programs have up to ``depth - 1`` conditions
+    :param cell: ``"gru"``, ``"lstm"``, ``"rnn"`` or ``"affine"``
+    :param condition_size: hidden units per condition
+    :param temperature: of the sigmoid in the soft semantics, above 0
+    :param net_arch: hidden layers of the critic
+    :param activation_fn: of the critic
+    :param log_std_init: initial logarithm of the standard deviation of Box actions
+    :param optimizer_class: of the inner updates
+    :param optimizer_kwargs: of the optimizer; for Adam ``eps=1e-5`` and the fused kernel by default
+    :param reset_state_at_episode_start: zero the conditions' states when an episode starts; by default they survive
+        it, and only the caller's ``state=None`` (or a task switch in ``ReptilePPO``) zeroes them (section 2.4)
+    :param kwargs: further arguments of SB3's ``ActorCriticPolicy``
+    :raises ValueError: if a space or a value is not accepted
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        lr_schedule: Schedule,
+        depth: int = 3,
+        cell: Cell = "gru",
+        condition_size: int = 1,
+        temperature: float = 1.0,
+        net_arch: list[int] | None = None,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        log_std_init: float = 0.0,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        reset_state_at_episode_start: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
+            raise ValueError(
+                f"observation space {observation_space} is not accepted; programs read one-dimensional Box "
+                "observations. Wrap the environment in gymnasium.wrappers.FlattenObservation"
+            )
+        if temperature <= 0:
+            raise ValueError(f"temperature={temperature} is not accepted; it is above 0")
+        if kwargs.pop("use_sde", False):
+            raise ValueError("use_sde=True is not accepted; a program's Box actions have a state-independent noise")
+        self.program_kwargs: dict[str, Any] = {
+            "depth": depth,
+            "cell": cell,
+            "condition_size": condition_size,
+            "temperature": temperature,
+        }
+        self.spec_of_actions: ActionSpec = action_spec(action_space)
+        self.reset_state_at_episode_start = reset_state_at_episode_start
+        if optimizer_kwargs is None and optimizer_class is th.optim.Adam:
+            # SB3's epsilon for PPO, and one kernel for all parameters.
+            optimizer_kwargs = {"eps": 1e-5, "fused": True}
+        # Past RecurrentActorCriticPolicy's own constructor, which would build two LSTMs that no program uses.
+        ActorCriticPolicy.__init__(
+            self,
+            observation_space,
+            action_space,
+            lr_schedule,
+            net_arch={"pi": [], "vf": [64, 64] if net_arch is None else net_arch},
+            activation_fn=activation_fn,
+            log_std_init=log_std_init,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            **kwargs,
+        )
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        """Build the program, the critic and the optimizer."""
+        self.mlp_extractor = MlpExtractor(self.features_dim, self.net_arch, self.activation_fn, self.device)
+        self.module = ProgramModule(self.features_dim, self.spec_of_actions, **self.program_kwargs)
+        self.value_net = nn.Linear(self.mlp_extractor.latent_dim_vf, 1)
+        if isinstance(self.action_dist, DiagGaussianDistribution):
+            self.log_std = nn.Parameter(th.full((self.spec_of_actions.n_outputs,), self.log_std_init))
+        if self.ortho_init:
+            # Small controllers, so that all actions are equally likely at the start.
+            for layer, gain in ((self.mlp_extractor, 2**0.5), (self.module.controllers, 0.01), (self.value_net, 1.0)):
+                layer.apply(partial(self.init_weights, gain=gain))
+        self.optimizer = self.optimizer_class(
+            [
+                {"params": self.phi(), "lr": lr_schedule(1)},
+                {"params": self.derivation_parameters(), "lr": DERIVATION_LR_SCALE * lr_schedule(1)},
+            ],
+            **self.optimizer_kwargs,
+        )
+
+    def derivation_parameters(self) -> list[nn.Parameter]:
+        """Return W."""
+        return [self.module.search.logits]
+
+    def phi(self) -> list[nn.Parameter]:
+        """Return every parameter but W: conditions, controllers, critic."""
+        derivation = {id(parameter) for parameter in self.derivation_parameters()}
+        return [parameter for parameter in self.parameters() if id(parameter) not in derivation]
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data.update(
+            self.program_kwargs,
+            net_arch=cast(dict[str, list[int]], self.net_arch)["vf"],
+            reset_state_at_episode_start=self.reset_state_at_episode_start,
+        )
+        # Arguments of SB3's constructor that a program has no use for.
+        for name in ("use_sde", "full_std", "use_expln"):
+            data.pop(name, None)
+        return data
+
+    def set_temperature(self, temperature: float) -> None:
+        """Set the temperature of the sigmoid; towards 0 the program decides as its crisp form does.
+
+        :param temperature: above 0
+        """
+        self.module.temperature.fill_(temperature)
+
+    def program(
+        self,
+        input_names: tuple[str, ...] | None = None,
+        output_names: tuple[str, ...] | None = None,
+        interaction: bool | None = None,
+        **metadata: Any,
+    ) -> Program:
+        """Extract the most likely program as plain data (line 10 of algorithm 1).
+
+        An observation normaliser is folded into the weights, so that the program reads raw numbers.
+
+        :param input_names: one name per number of X; ``x[0]``, ``x[1]`` ... if ``None``
+        :param output_names: one name per controller output; ``a[0]`` ... if ``None``
+        :param interaction: whether X ends with the interaction history
+        :param metadata: JSON values to keep with the program
+        """
+        module = self.module.extract()
+        if isinstance(self.features_extractor, NormalizingExtractor):
+            self.features_extractor.fold_into(module)
+        n_inputs = self.module.n_inputs
+        history = self.spec_of_actions.history_size + 2
+        return Program(
+            body=module.to_syntax(),
+            n_observations=n_inputs - history if interaction else n_inputs,
+            action=self.spec_of_actions,
+            interaction=bool(interaction),
+            input_names=input_names or tuple(f"x[{i}]" for i in range(n_inputs)),
+            output_names=output_names or tuple(f"a[{i}]" for i in range(self.spec_of_actions.n_outputs)),
+            temperature=float(self.module.temperature),
+            metadata=metadata,
+        )
+
+    def _distribution(self, features: th.Tensor, tests: th.Tensor) -> Distribution:
+        """Return the action distribution of the soft semantics."""
+        parameters = self.module.mix(features, self.module.masses(tests))
+        if isinstance(self.action_dist, DiagGaussianDistribution):
+            return self.action_dist.proba_distribution(parameters, self.log_std)
+        return self.action_dist.proba_distribution(action_logits=parameters)
+
+    def _values(self, features: th.Tensor) -> th.Tensor:
+        return self.value_net(self.mlp_extractor.forward_critic(features))
+
+    def _split_features(self, obs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Return the features of the program and of the critic."""
+        features = self.extract_features(obs)
+        return features if isinstance(features, tuple) else (features, features)
+
+
+class RecurrentProgrammaticPolicy(ProgrammaticActorCritic, RecurrentActorCriticPolicy):
+    """The policy ``"ProgPolicy"``: a program with recurrent conditions, for ``RecurrentPPO`` and ``ReptilePPO``.
+
+    The states of the conditions take the place of the LSTM states: two tensors ``(1, n_envs, hidden_size)``, the
+    second used by LSTM conditions only. The critic has none.
+
+    See :class:`ProgrammaticActorCritic` for the arguments.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.lstm_hidden_state_shape = (1, 1, self.module.conditions.hidden_size)
+
+    @property
+    def lstm_actor(self) -> Conditions:  # type: ignore[override]
+        """The conditions, under the name by which ``RecurrentPPO`` asks for the size of the state."""
+        return self.module.conditions
+
+    def _tests(
+        self, features: th.Tensor, states: tuple[th.Tensor, ...], episode_starts: th.Tensor
+    ) -> tuple[th.Tensor, State]:
+        """Run the conditions over sequences laid out one after the other, as RecurrentPPO's batches are."""
+        if not self.reset_state_at_episode_start:
+            episode_starts = th.zeros_like(episode_starts)
+        conditions = cast(nn.LSTM, self.module.conditions)  # called alike
+        return cast(
+            tuple[th.Tensor, State], self._process_sequence(features, cast(State, states), episode_starts, conditions)
+        )
+
+    def forward(  # type: ignore[override]
+        self,
+        obs: th.Tensor,
+        lstm_states: RNNStates,
+        episode_starts: th.Tensor,
+        deterministic: bool = False,
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor, RNNStates]:
+        """Return actions, values, log-probabilities and new states. See ``RecurrentActorCriticPolicy.forward``."""
+        pi_features, vf_features = self._split_features(obs)
+        tests, states = self._tests(pi_features, lstm_states.pi, episode_starts)
+        distribution = self._distribution(pi_features, tests)
+        actions = distribution.get_actions(deterministic=deterministic)
+        log_prob = distribution.log_prob(actions)
+        actions = actions.reshape((-1, *self.action_space.shape))  # type: ignore[misc]
+        return actions, self._values(vf_features), log_prob, RNNStates(states, states)
+
+    def get_distribution(  # type: ignore[override]
+        self, obs: th.Tensor, lstm_states: tuple[th.Tensor, th.Tensor], episode_starts: th.Tensor
+    ) -> tuple[Distribution, tuple[th.Tensor, ...]]:
+        """Return the action distribution and new states. See ``RecurrentActorCriticPolicy.get_distribution``."""
+        features, _ = self._split_features(obs)
+        tests, states = self._tests(features, lstm_states, episode_starts)
+        return self._distribution(features, tests), states
+
+    def predict_values(  # type: ignore[override]
+        self,
+        obs: th.Tensor,
+        lstm_states: tuple[th.Tensor, th.Tensor] | None = None,
+        episode_starts: th.Tensor | None = None,
+    ) -> th.Tensor:
+        """Return the values ``(n, 1)``; the critic has no state, so that the other arguments change nothing."""
+        return self._values(self._split_features(obs)[1])
+
+    def evaluate_actions(  # type: ignore[override]
+        self, obs: th.Tensor, actions: th.Tensor, lstm_states: RNNStates, episode_starts: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+        """Return values, log-probabilities and entropies. See ``RecurrentActorCriticPolicy.evaluate_actions``."""
+        pi_features, vf_features = self._split_features(obs)
+        tests, _ = self._tests(pi_features, lstm_states.pi, episode_starts)
+        distribution = self._distribution(pi_features, tests)
+        return self._values(vf_features), distribution.log_prob(actions), distribution.entropy()
+
+
+class ProgrammaticPolicy(ProgrammaticActorCritic):
+    """The policy ``"PRLPolicy"``: a program with affine conditions, for SB3's ``PPO`` (PRL, Qiu and Zhu, 2022).
+
+    See :class:`ProgrammaticActorCritic` for the arguments; ``cell`` is ``"affine"``.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        if kwargs.setdefault("cell", "affine") != "affine":
+            raise ValueError(
+                f"cell={kwargs['cell']!r} is not accepted; recurrent cells need RecurrentProgrammaticPolicy"
+            )
+        super().__init__(*args, **kwargs)
+
+    def _distribution_of(self, features: th.Tensor) -> Distribution:
+        tests, _ = self.module.conditions(features, self.module.initial_state(1))
+        return self._distribution(features, tests)
+
+    def forward(self, obs: th.Tensor, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """Return actions, values and log-probabilities. See ``ActorCriticPolicy.forward``."""
+        pi_features, vf_features = self._split_features(obs)
+        distribution = self._distribution_of(pi_features)
+        actions = distribution.get_actions(deterministic=deterministic)
+        log_prob = distribution.log_prob(actions)
+        actions = actions.reshape((-1, *self.action_space.shape))  # type: ignore[misc]
+        return actions, self._values(vf_features), log_prob
+
+    def get_distribution(self, obs: th.Tensor) -> Distribution:  # type: ignore[override]
+        """Return the action distribution. See ``ActorCriticPolicy.get_distribution``."""
+        return self._distribution_of(self._split_features(obs)[0])
+
+    def predict_values(self, obs: th.Tensor) -> th.Tensor:  # type: ignore[override]
+        """Return the values ``(n, 1)``."""
+        return self._values(self._split_features(obs)[1])
+
+    def evaluate_actions(  # type: ignore[override]
+        self, obs: th.Tensor, actions: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+        """Return values, log-probabilities and entropies. See ``ActorCriticPolicy.evaluate_actions``."""
+        pi_features, vf_features = self._split_features(obs)
+        distribution = self._distribution_of(pi_features)
+        return self._values(vf_features), distribution.log_prob(actions), distribution.entropy()

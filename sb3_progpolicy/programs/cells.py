@@ -1,0 +1,48 @@
+"""One step of each recurrent cell in NumPy, with the equations and the gate order of PyTorch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_progpolicy.programs.syntax import Cell
+
+Array = NDArray[np.floating]
+
+
+def sigmoid(x: Array) -> Array:
+    """Return the logistic function, without overflow."""
+    return cast(Array, 0.5 * np.tanh(0.5 * x) + 0.5)
+
+
+def rnn_step(gates: Array, recurrent: Array, hidden: Array, cell: Array) -> tuple[Array, Array]:
+    """Advance a tanh cell. See :data:`STEPS`."""
+    return np.tanh(gates + recurrent), cell
+
+
+def gru_step(gates: Array, recurrent: Array, hidden: Array, cell: Array) -> tuple[Array, Array]:
+    """Advance a GRU cell. See :data:`STEPS`."""
+    units = hidden.shape[-1]
+    both = sigmoid(gates[..., : 2 * units] + recurrent[..., : 2 * units])
+    new = np.tanh(gates[..., 2 * units :] + both[..., :units] * recurrent[..., 2 * units :])
+    return new + both[..., units:] * (hidden - new), cell
+
+
+def lstm_step(gates: Array, recurrent: Array, hidden: Array, cell: Array) -> tuple[Array, Array]:
+    """Advance an LSTM cell. See :data:`STEPS`."""
+    units = hidden.shape[-1]
+    total = gates + recurrent
+    i, f, o = (sigmoid(total[..., k * units : (k + 1) * units]) for k in (0, 1, 3))
+    cell = f * cell + i * np.tanh(total[..., 2 * units : 3 * units])
+    return o * np.tanh(cell), cell
+
+
+#: Cell name to its step: ``step(W_ih x + b_ih, W_hh h + b_hh, h, c) -> (h, c)``, arrays ``(..., width)``.
+STEPS: dict[Cell, Callable[[Array, Array, Array, Array], tuple[Array, Array]]] = {
+    "rnn": rnn_step,
+    "gru": gru_step,
+    "lstm": lstm_step,
+}

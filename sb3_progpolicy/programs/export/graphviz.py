@@ -1,0 +1,102 @@
+"""A program as a Graphviz drawing."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from sb3_progpolicy.programs.export.visitor import (
+    CELL_NAMES,
+    ProgramVisitor,
+    counted,
+    deliver,
+    input_importance,
+    largest_terms,
+    title,
+)
+from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, Program
+
+
+def export_graphviz(
+    program: Program,
+    out_file: str | os.PathLike[str] | Any | None = None,
+    decimals: int = 2,
+    max_terms: int | None = 3,
+) -> str | None:
+    """Draw a program in the DOT language.
+
+    Conditions are boxes, controllers are leaves with their largest terms. Render the source with ``dot -Tsvg`` or
+    ``graphviz.Source(source)``.
+
+    :param program: what to draw
+    :param out_file: a path or an open text file to write to
+    :param decimals: digits after the point
+    :param max_terms: terms shown of each sum; ``None`` for all
+    :return: the DOT source if ``out_file`` is ``None``, else ``None``
+    :raises ValueError: if the program is not well formed
+    """
+    printer = _DotPrinter(program, decimals, max_terms)
+    lines = [
+        "digraph Program {",
+        f"  label={_quote(title(program))}; labelloc=t; fontname=Helvetica;",
+        '  node [shape=box, style="rounded,filled", fontname=Helvetica, fontsize=11, color="#44546a"];',
+        '  edge [fontname=Helvetica, fontsize=11, color="#44546a"];',
+        *printer.visit(program.body),
+        "}",
+    ]
+    return deliver("\n".join(lines) + "\n", out_file)
+
+
+class _DotPrinter(ProgramVisitor[list[str]]):
+    def __init__(self, program: Program, decimals: int, max_terms: int | None) -> None:
+        super().__init__(program)
+        self.decimals, self.max_terms = decimals, max_terms
+
+    def visit_branch(self, branch: IfThenElse, index: int) -> list[str]:
+        following = f"B{index + 2}" if isinstance(branch.orelse, IfThenElse) else f"C{index + 2}"
+        return [
+            f'  B{index + 1} [fillcolor="#fdf0d5", label={_quote(*self._condition(branch.condition, index))}];',
+            *self.visit_controller(branch.then, index),
+            f'  B{index + 1} -> C{index + 1} [label="yes"];',
+            f'  B{index + 1} -> {following} [label="no"];',
+            *self.visit(branch.orelse, index + 1),
+        ]
+
+    def visit_controller(self, controller: Controller, index: int) -> list[str]:
+        lines = [
+            f"{name} = {self._sum(constant, weights, self.program.input_names)}"
+            for name, constant, weights in zip(
+                self.program.output_names, controller.bias, controller.weights, strict=True
+            )
+        ]
+        # \l ends a line that is set flush left.
+        return [f'  C{index + 1} [fillcolor="#e3f0f7", label={_quote(*lines, end="l")}];']
+
+    def _condition(self, condition: Condition, index: int) -> list[str]:
+        if condition.cell == "affine":
+            return [
+                f"B{index + 1} >= 0 ?",
+                self._sum(condition.readout_bias, condition.readout, self.program.input_names),
+            ]
+        units = [f"h{unit + 1}" for unit in range(condition.hidden_size)]
+        heard = largest_terms(0.0, input_importance(condition), self.program.input_names, 9, self.max_terms)
+        return [
+            f"B{index + 1} >= 0 ?",
+            f"B{index + 1} = {self._sum(condition.readout_bias, condition.readout, units)}",
+            f"memory: {counted(condition.hidden_size, f'{CELL_NAMES[condition.cell]} unit')}",
+            f"listens most to {', '.join(name for _, name in heard.shown) or 'nothing'}",
+        ]
+
+    def _sum(self, constant: float, weights: tuple[float, ...], names: Any) -> str:
+        terms = largest_terms(constant, weights, names, self.decimals, self.max_terms)
+        tokens = [
+            f"{round(constant, self.decimals) or 0.0:.{self.decimals}f}",
+            *(f"{weight:+.{self.decimals}f} {name}" for weight, name in terms.shown),
+        ]
+        return "  ".join(tokens) + (" ..." if terms.n_dropped else "")
+
+
+def _quote(*lines: str, end: str = "n") -> str:
+    escaped = (line.replace("\\", "\\\\").replace('"', '\\"') for line in lines)
+    joined = f"\\{end}".join(escaped)
+    return f'"{joined}\\l"' if end == "l" else f'"{joined}"'

@@ -1,0 +1,134 @@
+"""A program as LaTeX."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+from sb3_progpolicy.programs.export.visitor import ProgramVisitor, deliver
+from sb3_progpolicy.programs.syntax import GATES, ActionSpec, Condition, Controller, IfThenElse, Matrix, Program
+
+_ESCAPES = {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    **{character: f"\\{character}" for character in "#$%&_{}"},
+}
+# Gates are stacked in W, b, U and d from top to bottom in the order of the rows named here.
+_CELLS = {
+    "rnn": (r"h_{%d} &\leftarrow \tanh(W x + b + U h_{%d} + d)",),
+    "gru": (
+        r"(r, z) &= \sigma(W_{r,z} x + b_{r,z} + U_{r,z} h_{%d} + d_{r,z})",
+        r"n &= \tanh(W_n x + b_n + r \odot (U_n h_{%d} + d_n))",
+        r"h_{%d} &\leftarrow (1 - z) \odot n + z \odot h_{%d}",
+    ),
+    "lstm": (
+        r"(i, f, o) &= \sigma(W_{i,f,o} x + b_{i,f,o} + U_{i,f,o} h_{%d} + d_{i,f,o})",
+        r"g &= \tanh(W_g x + b_g + U_g h_{%d} + d_g)",
+        r"c_{%d} &\leftarrow f \odot c_{%d} + i \odot g",
+        r"h_{%d} &\leftarrow o \odot \tanh(c_{%d})",
+    ),
+}
+
+
+def export_latex(
+    program: Program, out_file: str | os.PathLike[str] | Any | None = None, decimals: int = 2
+) -> str | None:
+    r"""Typeset a program: the case distinction, the conditions' recurrences and all matrices, in the paper's notation.
+
+    The result is a fragment for a document that loads ``amsmath``. All weights are given, none is dropped.
+
+    :param program: what to typeset
+    :param out_file: a path or an open text file to write to
+    :param decimals: digits after the point
+    :return: the LaTeX source if ``out_file`` is ``None``, else ``None``
+    :raises ValueError: if the program is not well formed
+    """
+    return deliver(_LatexPrinter(program, decimals).print(), out_file)
+
+
+class _LatexPrinter(ProgramVisitor[list[str]]):
+    def __init__(self, program: Program, decimals: int) -> None:
+        super().__init__(program)
+        self.decimals = decimals
+
+    def print(self) -> str:
+        program = self.program
+        blocks = [
+            [
+                r"\[",
+                r"y(x) = \begin{cases}",
+                *self.visit(program.body),
+                r"\end{cases}",
+                rf"\qquad {_rule(program.action)}",
+                r"\]",
+            ],
+            [r"\[", rf"x = {self._names(program.input_names)} \qquad y = {self._names(program.output_names)}", r"\]"],
+        ]
+        for index, condition in enumerate(program.conditions, start=1):
+            blocks.append([r"\[", r"\begin{aligned}", *self._condition(condition, index), r"\end{aligned}", r"\]"])
+        for index, controller in enumerate(program.controllers, start=1):
+            constant = rf"c_{{{index}}} = {self._vector(controller.bias)}"
+            blocks.append([r"\[", rf"{constant} \quad T_{{{index}}} = {self._matrix(controller.weights)}", r"\]"])
+        body = "\n".join(line for block in blocks for line in block)
+        return f"{{\\scriptsize\\setlength{{\\arraycolsep}}{{2pt}}\n{body}\n}}\n"
+
+    def visit_branch(self, branch: IfThenElse, index: int) -> list[str]:
+        word = "else if" if index else "if"
+        case = rf"{_affine(index)} & \text{{{word} }} B_{{{index + 1}}}(x) \ge 0 \\"
+        return [case, *self.visit(branch.orelse, index + 1)]
+
+    def visit_controller(self, controller: Controller, index: int) -> list[str]:
+        return [rf"{_affine(index)} & \text{{{'otherwise' if index else 'always'}}}"]
+
+    def _condition(self, condition: Condition, index: int) -> list[str]:
+        readout = self._matrix((condition.readout,))
+        constant = self._number(condition.readout_bias)
+        if condition.cell == "affine":
+            return [rf"B_{{{index}}}(x) &= {constant} + {readout} x"]
+        recurrence = [f"{line.replace('%d', str(index))} \\\\" for line in _CELLS[condition.cell]]
+        rows = ", ".join(GATES[condition.cell])
+        weights = rf"W = {self._matrix(condition.weight_ih)} \quad b = {self._vector(condition.bias_ih)}"
+        recurrent = rf"U = {self._matrix(condition.weight_hh)} \quad d = {self._vector(condition.bias_hh)}"
+        return [
+            rf"B_{{{index}}}(x) &= {constant} + {readout} h_{{{index}}} \\",
+            *recurrence,
+            rf"& {weights} \\",
+            rf"& {recurrent} \quad \text{{(rows: {rows})}}",
+        ]
+
+    def _names(self, names: Sequence[str]) -> str:
+        rows = r" \\ ".join(rf"\text{{{_escape(name)}}}" for name in names)
+        return rf"\left(\begin{{array}}{{l}} {rows} \end{{array}}\right)"
+
+    def _vector(self, vector: Sequence[float]) -> str:
+        return self._matrix(tuple((value,) for value in vector))
+
+    def _matrix(self, matrix: Matrix) -> str:
+        # array, because pmatrix stops at ten columns
+        rows = " \\\\\n  ".join(" & ".join(self._number(value) for value in row) for row in matrix)
+        return rf"\left(\begin{{array}}{{{'r' * len(matrix[0])}}} {rows} \end{{array}}\right)"
+
+    def _number(self, value: float) -> str:
+        return f"{value:.{self.decimals}f}" if round(value, self.decimals) else "0"
+
+
+def _affine(index: int) -> str:
+    return rf"c_{{{index + 1}}} + T_{{{index + 1}}} x"
+
+
+def _rule(action: ActionSpec) -> str:
+    return {
+        "discrete": r"\text{action} = \operatorname{arg\,max}_a y_a",
+        "multi_discrete": r"\text{action part} = \operatorname{arg\,max} \text{ over its own } y_a",
+        "multi_binary": r"\text{action}_a = [y_a > 0]",
+        "box": r"\text{action} = \min(\max(y, \text{low}), \text{high})",
+    }[action.kind]
+
+
+def _escape(text: str) -> str:
+    return "".join(_ESCAPES.get(character, character) for character in text)

@@ -1,0 +1,143 @@
+"""A program as plain text, for people."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sb3_progpolicy.programs.export.visitor import (
+    CELL_NAMES,
+    ProgramVisitor,
+    action_rule,
+    counted,
+    gate_names,
+    largest_terms,
+    pack,
+    title,
+)
+from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, Program
+
+WIDTH = 110
+INDENT = "    "
+_OPERATORS = frozenset(" +-*/=<>()")
+_RULES = {
+    "rnn": "RNN:  each step, h becomes the value of its line.",
+    "gru": "GRU:  each step, h becomes (1 - z)*n + z*h, so z near 1 keeps the memory and z near 0 writes n.",
+    "lstm": "LSTM: each step, c becomes f*c + i*g and h becomes o*tanh(c), so f keeps, i writes and o shows.",
+}
+
+
+def export_text(program: Program, decimals: int = 2, max_terms: int | None = 6) -> str:
+    """Print a program as an indented if-then-else that a person can read.
+
+    The terms of every sum stand in order of size; those that round to zero or come after ``max_terms`` are counted
+    at the end of the line. The full numbers are in :func:`export_python` and in the saved file.
+
+    :param program: what to print
+    :param decimals: digits after the point
+    :param max_terms: terms shown of each sum, apart from the constant; ``None`` for all
+    :return: lines of text, with a newline at the end
+    :raises ValueError: if the program is not well formed
+    """
+    return _TextPrinter(program, decimals, max_terms).print()
+
+
+class _TextPrinter(ProgramVisitor[list[str]]):
+    def __init__(self, program: Program, decimals: int, max_terms: int | None) -> None:
+        super().__init__(program)
+        self.decimals, self.max_terms = decimals, max_terms
+
+    def print(self) -> str:
+        lines = [*self._heading(), "", *self.visit(self.program.body)]
+        for index, condition in enumerate(self.program.conditions):
+            lines += ["", *self._condition(condition, index)]
+        cells = sorted({condition.cell for condition in self.program.conditions} & set(_RULES))
+        if cells:
+            lines += [
+                "",
+                *(_RULES[cell] for cell in cells),
+                "All memory starts at 0 and is kept until the task changes.",
+            ]
+        return "\n".join(lines) + "\n"
+
+    def visit_branch(self, branch: IfThenElse, index: int) -> list[str]:
+        word = "else if" if index else "if"
+        return [f"{word} B{index + 1} >= 0:", *self._lines(branch.then), *self.visit(branch.orelse, index + 1)]
+
+    def visit_controller(self, controller: Controller, index: int) -> list[str]:
+        return ["else:" if index else "always:", *self._lines(controller)]
+
+    def _heading(self) -> list[str]:
+        program = self.program
+        n_conditions = len(program.conditions)
+        reads = f"Every step it reads {counted(program.n_inputs, 'number')}: {program.n_observations} observed"
+        if program.interaction:
+            reads += f", {program.action.history_size} for the previous action, its reward and the done flag"
+        return [
+            f"{title(program)}: {counted(n_conditions, 'condition')}, {counted(n_conditions + 1, 'controller')}.",
+            f"{reads}.",
+            action_rule(program.action),
+            *(
+                ["The first B from the top that is not below 0 decides; all are computed at every step."]
+                * (n_conditions > 1)
+            ),
+        ]
+
+    def _lines(self, controller: Controller) -> list[str]:
+        names = self.program.output_names
+        width = max(len(name) for name in names)
+        lines = []
+        for name, constant, weights in zip(names, controller.bias, controller.weights, strict=True):
+            start = f"{INDENT}{name.ljust(width)} = "
+            lines += self._sum(start, constant, weights, self.program.input_names)
+        return lines
+
+    def _condition(self, condition: Condition, index: int) -> list[str]:
+        inputs, size = self.program.input_names, condition.hidden_size
+        start = f"B{index + 1} = "
+        if condition.cell == "affine":
+            return self._sum(start, condition.readout_bias, condition.readout, inputs)
+        units = [f"h{unit + 1}" for unit in range(size)]
+        lines = self._sum(start, condition.readout_bias, condition.readout, units)
+        lines.append(f"{INDENT}its memory: {counted(size, f'{CELL_NAMES[condition.cell]} unit')}")
+        rows = list(zip(gate_names(condition), self._gates(condition, [*inputs, *units]), strict=True))
+        for unit in range(size):
+            lines += [line for (_, owner), gate in rows if owner == unit for line in gate]
+        return lines
+
+    def _gates(self, condition: Condition, names: Sequence[str]) -> list[list[str]]:
+        gates = []
+        for row, (gate, unit) in enumerate(gate_names(condition)):
+            squash = "tanh" if gate in ("h", "n", "g") else "sigmoid"
+            recurrent, constant = condition.weight_hh[row], condition.bias_ih[row] + condition.bias_hh[row]
+            label = f"{INDENT}h{unit + 1} = " if gate == "h" else f"{INDENT}{gate}{unit + 1} = "
+            if gate != "n":
+                gates.append(
+                    self._sum(f"{label}{squash}(", constant, (*condition.weight_ih[row], *recurrent), names, ")")
+                )
+                continue
+            # r scales the recurrent part of n alone, so that part is a sum of its own.
+            inner = " ".join(self._tokens(condition.bias_hh[row], recurrent, names[self.program.n_inputs :]))
+            close = ")" if inner in ("0", "-0") else f" + r{unit + 1}*({inner}))"
+            inputs = names[: self.program.n_inputs]
+            gates.append(
+                self._sum(f"{label}{squash}(", condition.bias_ih[row], condition.weight_ih[row], inputs, close)
+            )
+        return gates
+
+    def _sum(
+        self, start: str, constant: float, weights: Sequence[float], names: Sequence[str], close: str = ""
+    ) -> list[str]:
+        tokens = self._tokens(constant, weights, names)
+        tokens[-1] += close
+        return pack(tokens, start, " " * len(start), WIDTH)
+
+    def _tokens(self, constant: float, weights: Sequence[float], names: Sequence[str]) -> list[str]:
+        terms = largest_terms(constant, weights, names, self.decimals, self.max_terms)
+        tokens = [f"{constant:.{self.decimals}f}"] if round(constant, self.decimals) else []
+        for weight, name in terms.shown:
+            sign = "-" if weight < 0 else "+" if tokens else ""
+            shown = f"[{name}]" if _OPERATORS & set(name) else name
+            tokens.append(f"{sign}{' ' if tokens else ''}{abs(weight):.{self.decimals}f}*{shown}")
+        if terms.n_dropped:
+            tokens.append(f"{'+ ' if tokens else ''}({counted(terms.n_dropped, 'smaller term')})")
+        return tokens or ["0"]

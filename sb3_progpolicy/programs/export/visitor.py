@@ -1,0 +1,140 @@
+"""What all printers share: walking the tree, and choosing which terms of a sum to show."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from sb3_progpolicy.programs.files import write_atomically
+from sb3_progpolicy.programs.syntax import GATES, ActionSpec, Condition, Controller, Expression, IfThenElse, Program
+from sb3_progpolicy.programs.validation import check_program
+
+Result = TypeVar("Result")
+
+CELL_NAMES = {"affine": "affine", "rnn": "RNN", "gru": "GRU", "lstm": "LSTM"}
+
+
+class ProgramVisitor(Generic[Result]):
+    """One output format: a method for each kind of node.
+
+    :param program: what is printed
+    :raises ValueError: if the program is not well formed
+    """
+
+    def __init__(self, program: Program) -> None:
+        check_program(program)
+        self.program = program
+
+    def visit(self, expression: Expression, index: int = 0) -> Result:
+        """Print a node; ``index`` counts the conditions passed on the way to it."""
+        if isinstance(expression, IfThenElse):
+            return self.visit_branch(expression, index)
+        return self.visit_controller(expression, index)
+
+    def visit_branch(self, branch: IfThenElse, index: int) -> Result:
+        """Print ``if B then C else E``."""
+        raise NotImplementedError
+
+    def visit_controller(self, controller: Controller, index: int) -> Result:
+        """Print ``c + T·X``."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Terms:
+    """A sum cut down to what a reader should see.
+
+    :param constant: the constant term
+    :param shown: (weight, name), the largest weight first
+    :param n_dropped: how many further terms are not zero but not shown
+    """
+
+    constant: float
+    shown: tuple[tuple[float, str], ...]
+    n_dropped: int
+
+
+def largest_terms(
+    constant: float, weights: Sequence[float], names: Sequence[str], decimals: int, max_terms: int | None
+) -> Terms:
+    """Sort the terms of ``constant + weights · names`` by size and drop those that round to zero.
+
+    :param decimals: digits after the point
+    :param max_terms: show no more than these; ``None`` for all
+    """
+    terms = sorted(((weight, name) for weight, name in zip(weights, names, strict=True) if weight), key=_by_size)
+    shown = [term for term in terms if round(term[0], decimals)][:max_terms]
+    return Terms(constant, tuple(shown), len(terms) - len(shown))
+
+
+def _by_size(term: tuple[float, str]) -> float:
+    return -abs(term[0])
+
+
+def input_importance(condition: Condition) -> tuple[float, ...]:
+    """How strongly a condition listens to each number of X: the absolute weights into each unit, times the unit's own
+    absolute weight in B, summed.
+    """
+    if condition.cell == "affine":
+        return tuple(abs(weight) for weight in condition.readout)
+    size = condition.hidden_size
+    return tuple(
+        sum(abs(weight * condition.readout[row % size]) for row, weight in enumerate(column))
+        for column in zip(*condition.weight_ih, strict=True)
+    )
+
+
+def gate_names(condition: Condition) -> list[tuple[str, int]]:
+    """The gate and the unit that each row of a condition's weights belongs to."""
+    return [(gate, unit) for gate in GATES[condition.cell] for unit in range(condition.hidden_size)]
+
+
+def action_rule(action: ActionSpec) -> str:
+    """How an action is chosen from a controller's outputs, as a sentence."""
+    if action.kind == "discrete":
+        return "Each line gives the score of one action; the action with the highest score is taken."
+    if action.kind == "multi_discrete":
+        return "Each line gives the score of one choice; in every part of the action the highest score is taken."
+    if action.kind == "multi_binary":
+        return "Each line gives the score of one switch; it is on where the score is above 0."
+    return "Each line gives one number of the action, which is then clipped to its bounds."
+
+
+def title(program: Program) -> str:
+    """The program's name, from ``metadata["env_id"]`` where that is a printable string."""
+    environment = program.metadata.get("env_id")
+    known = isinstance(environment, str) and environment.isprintable() and 0 < len(environment) <= 100
+    return f"Program for {environment}" if known else "Program"
+
+
+def counted(number: int, noun: str) -> str:
+    """``1 condition``, ``2 conditions``."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def pack(tokens: Iterable[str], first: str, following: str, width: int) -> list[str]:
+    """Fill lines with tokens and one space between them, never breaking a token.
+
+    :param first: start of the first line
+    :param following: start of the other lines
+    """
+    lines, line, empty = [], first, True
+    for token in tokens:
+        if not empty and len(line) + 1 + len(token) > width:
+            lines.append(line)
+            line, empty = following, True
+        line, empty = line + ("" if empty else " ") + token, False
+    return [*lines, line]
+
+
+def deliver(text: str, out_file: str | os.PathLike[str] | Any | None) -> str | None:
+    """Return the text, or write it to a path or an open file and return ``None``, as scikit-learn does."""
+    if out_file is None:
+        return text
+    if isinstance(out_file, (str, os.PathLike)):
+        write_atomically(out_file, text)
+    else:
+        out_file.write(text)
+    return None

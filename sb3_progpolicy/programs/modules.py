@@ -1,0 +1,286 @@
+"""The differentiable program: every derivation of the graph computed at once, mixed by W."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import cast
+
+import torch as th
+from torch import nn
+
+from sb3_progpolicy.programs.grammar import derivations
+from sb3_progpolicy.programs.recurrence import scan
+from sb3_progpolicy.programs.search import DerivationSearch
+from sb3_progpolicy.programs.syntax import GATES, ActionSpec, Cell, Condition, Controller, Expression, IfThenElse
+
+State = tuple[th.Tensor, th.Tensor]
+
+_LAYERS: dict[Cell, Callable[[int, int], nn.RNNBase]] = {"rnn": nn.RNN, "gru": nn.GRU, "lstm": nn.LSTM}
+CELLS: tuple[Cell, ...] = ("affine", *_LAYERS)
+
+
+class Conditions(nn.Module):
+    """All conditions ``B_1 ... B_K`` of a program in one recurrent layer.
+
+    The recurrent matrix is block-diagonal: entries between the units of different conditions are zero and get no
+    gradient, so that each condition has a state of its own while one fused kernel computes them all.
+
+    The module is called like ``torch.nn.LSTM`` whatever the cell, so that sb3-contrib's sequence handling can run
+    it; cells without a second state pass it through.
+
+    :param n_inputs: length of X
+    :param n_conditions: K, 0 or more
+    :param cell: ``"gru"``, ``"lstm"``, ``"rnn"``, or ``"affine"`` for conditions without a state
+    :param size: hidden units per condition, at least 1
+    """
+
+    num_layers = 1
+
+    def __init__(self, n_inputs: int, n_conditions: int, cell: Cell = "gru", size: int = 1) -> None:
+        super().__init__()
+        if cell not in CELLS:
+            raise ValueError(f"cell={cell!r} is not accepted; known cells: {', '.join(CELLS)}")
+        if size < 1:
+            raise ValueError(f"condition size {size} is not accepted; it is at least 1")
+        self.input_size, self.n_conditions, self.cell, self.size = n_inputs, n_conditions, cell, size
+        self.recurrent = cell != "affine" and n_conditions > 0
+        # SB3 keeps states as arrays of this width; it cannot be 0.
+        self.hidden_size = n_conditions * size if self.recurrent else 1
+        if self.recurrent:
+            self.rnn = _LAYERS[cell](n_inputs, self.hidden_size)
+            self._make_block_diagonal()
+            self.readout = nn.Parameter(th.ones(n_conditions, size) / size**0.5)
+            self.readout_bias = nn.Parameter(th.zeros(n_conditions))
+        elif n_conditions:
+            self.affine = nn.Linear(n_inputs, n_conditions)
+
+    def _make_block_diagonal(self) -> None:
+        blocks = th.block_diag(*[th.ones(self.size, self.size)] * self.n_conditions)
+        mask = blocks.repeat(len(GATES[self.cell]), 1)
+        weight = cast(nn.Parameter, self.rnn.weight_hh_l0)
+        with th.no_grad():
+            weight.mul_(mask)
+        weight.register_hook(lambda gradient: gradient * mask.to(gradient.device))
+
+    def forward(self, inputs: th.Tensor, state: State) -> tuple[th.Tensor, State]:
+        """Compute every B for a sequence.
+
+        :param inputs: X, ``(n_steps, n_sequences, n_inputs)``
+        :param state: two tensors ``(1, n_sequences, hidden_size)``
+        :return: B, ``(n_steps, n_sequences, n_conditions)``, and the state after the last step
+        """
+        if not self.n_conditions:
+            return inputs.new_zeros(*inputs.shape[:-1], 0), state
+        if not self.recurrent:
+            return self.affine(inputs), state
+        if self.cell == "lstm":
+            hidden, state = self.rnn(inputs, state)
+        elif inputs.device.type == "cpu" and inputs.dtype == th.float32:
+            hidden = self._scan(inputs, state[0][0])
+            state = (hidden[-1:], state[1])
+        else:
+            hidden, last = self.rnn(inputs, state[0])
+            state = (last, state[1])
+        units = hidden.unflatten(-1, (self.n_conditions, self.size))
+        return (units * self.readout).sum(-1) + self.readout_bias, state
+
+    def _scan(self, inputs: th.Tensor, hidden: th.Tensor) -> th.Tensor:
+        names = ("weight_ih_l0", "bias_ih_l0", "weight_hh_l0", "bias_hh_l0")
+        input_weight, input_bias, weight, bias = (cast(th.Tensor, getattr(self.rnn, name)) for name in names)
+        return scan(self.cell, nn.functional.linear(inputs, input_weight, input_bias), weight, bias, hidden)
+
+    def to_syntax(self, k: int) -> Condition:
+        """Return condition ``k`` (0-based) as plain data."""
+        if not self.recurrent:
+            weight, bias = self.affine.weight[k], self.affine.bias[k]
+            return Condition("affine", (), (), (), (), _vector(weight), float(bias))
+        n_gates = len(GATES[self.cell])
+        rows = slice(k * self.size, (k + 1) * self.size)
+
+        def gates(parameter: th.Tensor | nn.Module) -> th.Tensor:
+            return cast(th.Tensor, parameter).unflatten(0, (n_gates, self.hidden_size))[:, rows].flatten(0, 1)
+
+        return Condition(
+            cell=self.cell,
+            weight_ih=_matrix(gates(self.rnn.weight_ih_l0)),
+            weight_hh=_matrix(gates(self.rnn.weight_hh_l0)[:, rows]),
+            bias_ih=_vector(gates(self.rnn.bias_ih_l0)),
+            bias_hh=_vector(gates(self.rnn.bias_hh_l0)),
+            readout=_vector(self.readout[k]),
+            readout_bias=float(self.readout_bias[k]),
+        )
+
+    def keep(self, n_conditions: int) -> Conditions:
+        """Return a module of the first ``n_conditions`` conditions alone, with copies of their parameters."""
+        kept = Conditions(self.input_size, n_conditions, self.cell, self.size)
+        rows = slice(0, n_conditions * self.size)
+        with th.no_grad():
+            for name, parameter in kept.named_parameters():
+                source: th.Tensor = self.get_parameter(name)
+                if name.startswith("rnn."):
+                    source = source.unflatten(0, (len(GATES[self.cell]), self.hidden_size))[:, rows].flatten(0, 1)
+                    source = source[:, rows] if name == "rnn.weight_hh_l0" else source
+                else:
+                    source = source[:n_conditions]
+                parameter.copy_(source)
+        return kept
+
+
+class ProgramModule(nn.Module):
+    """All programs of a derivation graph under the soft semantics of section 2.2, mixed with W's probabilities.
+
+    ``[[if B then C else E]] = s(B)·C + (1 - s(B))·E`` with ``s`` the sigmoid. The mixture is linear in the
+    controllers, so that each of the ``2 depth - 1`` controllers has one weight, here called its mass: the probability
+    that a program is drawn from W and its branches, drawn from the sigmoids, lead to that controller. One cumulative
+    product over the conditions and one over the choices give all masses in O(depth).
+
+    For discrete actions the controllers' action probabilities are mixed, for Box actions their values.
+
+    :param n_inputs: length of X
+    :param action: the action space
+    :param depth: layers of the derivation graph, at least 1; programs have 0 to ``depth - 1`` conditions
+    :param cell: see :class:`Conditions`
+    :param condition_size: hidden units per condition
+    :param temperature: of the sigmoid, above 0; towards 0 the soft semantics becomes the crisp one
+    """
+
+    def __init__(
+        self,
+        n_inputs: int,
+        action: ActionSpec,
+        depth: int = 3,
+        cell: Cell = "gru",
+        condition_size: int = 1,
+        temperature: float = 1.0,
+    ) -> None:
+        super().__init__()
+        self.n_inputs, self.action, self.depth = n_inputs, action, depth
+        self.derivations = derivations(depth)
+        self.conditions = Conditions(n_inputs, depth - 1, cell, condition_size)
+        # Rows: the then-controllers C'_1 ... C'_K, then the last controllers C_1 ... C_depth.
+        self.controllers = nn.Linear(n_inputs, (2 * depth - 1) * action.n_outputs)
+        self.search = DerivationSearch(depth)
+        self.temperature: th.Tensor
+        self.register_buffer("temperature", th.tensor(float(temperature)))
+
+    @property
+    def n_controllers(self) -> int:
+        """Number of controllers in the graph."""
+        return 2 * self.depth - 1
+
+    def masses(self, tests: th.Tensor, crisp: bool = False) -> th.Tensor:
+        """Return the mass of every controller.
+
+        :param tests: the values of B, ``(..., depth - 1)``
+        :param crisp: decide each branch by ``B >= 0`` instead of weighing it
+        :return: ``(..., 2 depth - 1)``, non-negative, summing to 1; then-controllers first
+        """
+        taken = (tests >= 0).to(tests.dtype) if crisp else th.sigmoid(tests / self.temperature)
+        missed = th.cumprod(1 - taken, dim=-1)
+        one = th.ones_like(tests[..., :1]) if self.depth > 1 else tests.new_ones(*tests.shape[:-1], 1)
+        reached = th.cat((one, missed), dim=-1)
+        then = taken * reached[..., :-1] * self.search.at_least()
+        return th.cat((then, reached * self.search.probabilities()), dim=-1)
+
+    def mix(self, inputs: th.Tensor, masses: th.Tensor) -> th.Tensor:
+        """Return the parameters of the action distribution.
+
+        :param inputs: X, ``(..., n_inputs)``
+        :param masses: ``(..., 2 depth - 1)``
+        :return: ``(..., n_outputs)``: means for Box, log-probabilities for Discrete and MultiDiscrete (per component),
+            log-odds for MultiBinary
+        """
+        flat = inputs.flatten(0, -2)
+        # Rows last: softmax and sums then run along contiguous memory, twice as fast as over a last axis of a few.
+        outputs = th.addmm(self.controllers.bias.unsqueeze(1), self.controllers.weight, flat.T)
+        outputs = outputs.unflatten(0, (self.n_controllers, self.action.n_outputs))
+        weights = masses.flatten(0, -2).T.unsqueeze(1)
+        return self._mix_rows(outputs, weights).T.unflatten(0, inputs.shape[:-1])
+
+    def _mix_rows(self, outputs: th.Tensor, weights: th.Tensor) -> th.Tensor:
+        """Mix ``(n_controllers, n_outputs, rows)`` with weights ``(n_controllers, 1, rows)``."""
+        if self.action.kind == "box":
+            return (weights * outputs).sum(0)
+        if self.action.kind == "multi_binary":
+            on, off = (weights * th.sigmoid(sign * outputs) for sign in (1, -1))
+            return _log(on.sum(0)) - _log(off.sum(0))
+        components = outputs.split(list(self.action.sizes), dim=1)
+        return th.cat([_log((weights * component.softmax(1)).sum(0)) for component in components])
+
+    def forward(self, inputs: th.Tensor, state: State, crisp: bool = False) -> tuple[th.Tensor, State]:
+        """Run the program over a sequence.
+
+        :param inputs: X, ``(n_steps, n_sequences, n_inputs)``
+        :param state: two tensors ``(1, n_sequences, hidden_size)``; zeros at the start of a task
+        :param crisp: run every program as a real if-then-else
+        :return: distribution parameters ``(n_steps, n_sequences, n_outputs)`` (see :meth:`mix`) and the new state
+        """
+        tests, state = self.conditions(inputs, state)
+        return self.mix(inputs, self.masses(tests, crisp)), state
+
+    def initial_state(self, n_sequences: int) -> State:
+        """Return the zero state of ``n_sequences`` sequences."""
+        zeros = self.controllers.weight.new_zeros(1, n_sequences, self.conditions.hidden_size)
+        return zeros, zeros.clone()
+
+    def extract(self, n_conditions: int | None = None) -> ProgramModule:
+        """Return one program of the graph as a module of its own, computing what it computed inside the mixture.
+
+        :param n_conditions: which program; the most likely one under W if ``None``
+        :raises ValueError: if the graph has no such program
+        """
+        n_conditions = self.search.most_likely() if n_conditions is None else n_conditions
+        if not 0 <= n_conditions < self.depth:
+            raise ValueError(f"n_conditions={n_conditions} is not accepted; this graph has 0 to {self.depth - 1}")
+        module = ProgramModule(
+            self.n_inputs,
+            self.action,
+            n_conditions + 1,
+            self.conditions.cell,
+            self.conditions.size,
+            float(self.temperature),
+        )
+        module.conditions = self.conditions.keep(n_conditions)
+        # In the new graph only the deepest program is drawn, so only its controllers need values.
+        rows = self._controller_rows(n_conditions)
+        with th.no_grad():
+            module.controllers.weight.zero_()
+            module.controllers.bias.zero_()
+            targets = module._controller_rows(n_conditions)
+            for name in ("weight", "bias"):
+                blocks = self.controllers.get_parameter(name).unflatten(0, (self.n_controllers, -1))
+                module.controllers.get_parameter(name).unflatten(0, (module.n_controllers, -1))[targets] = blocks[rows]
+        module.search.select(n_conditions)
+        return module
+
+    def to_syntax(self, n_conditions: int | None = None) -> Expression:
+        """Return one program of the graph as plain data.
+
+        :param n_conditions: which program; the most likely one under W if ``None``
+        """
+        n_conditions = self.search.most_likely() if n_conditions is None else n_conditions
+        weights = self.controllers.weight.unflatten(0, (self.n_controllers, -1))
+        biases = self.controllers.bias.unflatten(0, (self.n_controllers, -1))
+        *then, last = (
+            Controller(_matrix(weights[row]), _vector(biases[row])) for row in self._controller_rows(n_conditions)
+        )
+        expression: Expression = last
+        for k in reversed(range(n_conditions)):
+            expression = IfThenElse(self.conditions.to_syntax(k), then[k], expression)
+        return expression
+
+    def _controller_rows(self, n_conditions: int) -> list[int]:
+        """Which controllers a program uses: its then-controllers, then its last one."""
+        return [*range(n_conditions), self.depth - 1 + n_conditions]
+
+
+def _log(probabilities: th.Tensor) -> th.Tensor:
+    return th.log(probabilities.clamp_min(th.finfo(probabilities.dtype).tiny))
+
+
+def _vector(values: th.Tensor) -> tuple[float, ...]:
+    return tuple(values.detach().tolist())
+
+
+def _matrix(values: th.Tensor) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(row) for row in values.detach().tolist())

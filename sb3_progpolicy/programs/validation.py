@@ -1,0 +1,163 @@
+"""The rules that make a program well formed, checked before it is run, printed, saved or believed from a file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, get_args
+
+from sb3_progpolicy.programs.syntax import GATES, ActionKind, ActionSpec, Condition, Controller, IfThenElse, Program
+
+MAX_CONDITIONS = 64
+MAX_NUMBERS = 100_000  # length of X and of a controller's output
+MAX_HIDDEN = 4096
+MAX_NAME_LENGTH = 200
+MAX_METADATA_DEPTH = 16
+
+
+def check_program(program: Program) -> None:
+    """Check that sizes agree, numbers are finite and names are printable.
+
+    :param program: any program
+    :raises ValueError: naming the first field at fault, what it holds and what is accepted
+    """
+    if not isinstance(program, Program):
+        raise ValueError(f"{type(program).__name__} given; a sb3_progpolicy.programs.Program is accepted")
+    _check_action(program.action)
+    _check_inputs(program)
+    _check_names("output_names", program.output_names, program.action.n_outputs)
+    if not _is_finite(program.temperature) or program.temperature <= 0:
+        raise ValueError(f"temperature={program.temperature!r} is not accepted; it is a finite number above 0")
+    expression, index = program.body, 0
+    while isinstance(expression, IfThenElse):
+        if index == MAX_CONDITIONS:
+            raise ValueError(f"branches: more than {MAX_CONDITIONS} conditions are not accepted")
+        _check_condition(f"branches[{index}].if", expression.condition, program.n_inputs)
+        _check_controller(f"branches[{index}].then", expression.then, program)
+        expression, index = expression.orelse, index + 1
+    _check_controller("else", expression, program)
+    if not isinstance(program.metadata, Mapping):
+        raise ValueError(f"metadata: {type(program.metadata).__name__} given; a mapping is accepted")
+    _check_json("metadata", dict(program.metadata), MAX_METADATA_DEPTH)
+
+
+def _check_action(action: ActionSpec) -> None:
+    if not isinstance(action, ActionSpec):
+        raise ValueError(f"action: {type(action).__name__} given; an ActionSpec is accepted")
+    if action.kind not in get_args(ActionKind):
+        raise ValueError(f"action.kind={action.kind!r} is not accepted; it is one of {', '.join(get_args(ActionKind))}")
+    sizes = action.sizes
+    if not isinstance(sizes, tuple) or not sizes or not all(_is_int(size) and size > 0 for size in sizes):
+        raise ValueError(f"action.sizes={_short(sizes)} is not accepted; it is a tuple of whole numbers above 0")
+    if action.kind != "multi_discrete" and len(sizes) != 1:
+        raise ValueError(f"action.sizes={_short(sizes)} is not accepted; {action.kind!r} has one size")
+    if action.n_outputs > MAX_NUMBERS:
+        raise ValueError(f"action.sizes={_short(sizes)} is not accepted; they sum to at most {MAX_NUMBERS}")
+    if not _is_int(action.start) or (action.start != 0 and action.kind != "discrete"):
+        raise ValueError(f"action.start={action.start!r} is not accepted; a whole number, 0 unless kind is 'discrete'")
+    n_bounds = sizes[0] if action.kind == "box" else 0
+    _check_vector("action.low", action.low, n_bounds)
+    _check_vector("action.high", action.high, n_bounds)
+    if any(low > high for low, high in zip(action.low, action.high, strict=True)):
+        raise ValueError("action.low: a lower bound is above its upper bound in action.high")
+
+
+def _check_inputs(program: Program) -> None:
+    if not _is_int(program.n_observations) or not 0 <= program.n_observations <= MAX_NUMBERS:
+        raise ValueError(f"n_observations={program.n_observations!r} is not accepted; 0 to {MAX_NUMBERS}")
+    if not isinstance(program.interaction, bool):
+        raise ValueError(f"interaction={program.interaction!r} is not accepted; it is true or false")
+    history = program.action.history_size + 2 if program.interaction else 0
+    _check_names("input_names", program.input_names, program.n_observations + history)
+
+
+def _check_condition(path: str, condition: Condition, n_inputs: int) -> None:
+    if not isinstance(condition, Condition):
+        raise ValueError(f"{path}: {type(condition).__name__} given; a Condition is accepted")
+    if condition.cell not in GATES:
+        raise ValueError(f"{path}.cell={condition.cell!r} is not accepted; it is one of {', '.join(GATES)}")
+    n_hidden = condition.hidden_size
+    if condition.cell != "affine" and not 1 <= n_hidden <= MAX_HIDDEN:
+        raise ValueError(f"{path}.readout: {n_hidden} hidden units given; 1 to {MAX_HIDDEN} are accepted")
+    n_rows = n_hidden * len(GATES[condition.cell])
+    _check_matrix(f"{path}.weight_ih", condition.weight_ih, n_rows, n_inputs)
+    _check_matrix(f"{path}.weight_hh", condition.weight_hh, n_rows, n_hidden)
+    _check_vector(f"{path}.bias_ih", condition.bias_ih, n_rows)
+    _check_vector(f"{path}.bias_hh", condition.bias_hh, n_rows)
+    _check_vector(f"{path}.readout", condition.readout, n_hidden or n_inputs)
+    _check_vector(f"{path}.readout_bias", (condition.readout_bias,), 1)
+
+
+def _check_controller(path: str, controller: Controller, program: Program) -> None:
+    if not isinstance(controller, Controller):
+        raise ValueError(f"{path}: {type(controller).__name__} given; a Controller is accepted")
+    _check_matrix(f"{path}.weights", controller.weights, program.action.n_outputs, program.n_inputs)
+    _check_vector(f"{path}.bias", controller.bias, program.action.n_outputs)
+
+
+def _check_matrix(path: str, matrix: Any, n_rows: int, n_columns: int) -> None:
+    if not isinstance(matrix, tuple) or len(matrix) != n_rows:
+        raise ValueError(f"{path}: {_count(matrix, 'rows')} given; a tuple of {n_rows} rows is accepted")
+    for index, row in enumerate(matrix):
+        _check_vector(f"{path}[{index}]", row, n_columns)
+
+
+def _check_vector(path: str, vector: Any, length: int) -> None:
+    if not isinstance(vector, tuple) or len(vector) != length:
+        raise ValueError(f"{path}: {_count(vector, 'numbers')} given; a tuple of {length} numbers is accepted")
+    for value in vector:
+        if not _is_finite(value):
+            raise ValueError(f"{path}: {_short(value)} is not accepted; finite numbers are")
+
+
+def _check_names(path: str, names: Any, length: int) -> None:
+    if not isinstance(names, tuple) or len(names) != length:
+        raise ValueError(f"{path}: {_count(names, 'names')} given; a tuple of {length} names is accepted")
+    for name in names:
+        # Names end up in source code and markup, so nothing that breaks a line may pass.
+        if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME_LENGTH or not name.isprintable():
+            raise ValueError(
+                f"{path}: {_short(name)} is not accepted; a name is 1 to {MAX_NAME_LENGTH} printable characters"
+            )
+
+
+def _check_json(path: str, value: Any, depth: int) -> None:
+    if depth == 0:
+        raise ValueError(f"{path}: nested more than {MAX_METADATA_DEPTH} deep, which is not accepted")
+    if isinstance(value, dict):
+        for key, item in value.items():
+            if not isinstance(key, str):
+                raise ValueError(f"{path}: the key {_short(key)} is not accepted; keys are strings")
+            _check_json(f"{path}[{_short(key)}]", item, depth - 1)
+    elif isinstance(value, list):
+        for item in value:
+            _check_json(f"{path}[]", item, depth - 1)
+    elif value is not None and type(value) not in (str, bool) and not _is_json_number(value):
+        raise ValueError(
+            f"{path}: {_short(value)} ({type(value).__name__}) is not accepted; "
+            "JSON values are: dict, list, str, int of 64 bits, finite float, bool, None"
+        )
+
+
+def _is_int(value: Any) -> bool:
+    return type(value) is int
+
+
+def _is_json_number(value: Any) -> bool:
+    return abs(value) < 2**63 if _is_int(value) else type(value) is float and math.isfinite(value)
+
+
+def _is_finite(value: Any) -> bool:
+    """Whether ``value`` is a Python number that a float holds exactly."""
+    if _is_int(value):
+        return abs(value) <= 2**53
+    return isinstance(value, float) and math.isfinite(value)
+
+
+def _count(value: Any, what: str) -> str:
+    return f"{len(value)} {what}" if isinstance(value, Sequence) else f"{_short(value)} instead of {what}"
+
+
+def _short(value: Any) -> str:
+    text = repr(value) if not isinstance(value, int) or abs(value) < 10**50 else "a huge whole number"
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,119 @@
+"""Vectorised environments: the fastest one there is for an id, and an adapter for Gymnasium's batched ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from numpy.typing import NDArray
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+
+
+class BatchedVecEnv(VecEnv):
+    """A Gymnasium ``VectorEnv`` that resets within the step, as an SB3 ``VecEnv``.
+
+    Attributes and methods reached through ``get_attr``, ``set_attr`` and ``env_method`` are the batch's own, the same
+    for every environment. A variation is set by ``set_options(variation)`` and the next ``reset``, one for all
+    environments, or a list with one for each.
+
+    :param env: a vector environment whose autoreset mode is ``SAME_STEP``
+    :raises ValueError: for another autoreset mode
+    """
+
+    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
+        mode = env.metadata.get("autoreset_mode")
+        if mode != AutoresetMode.SAME_STEP:
+            raise ValueError(f"autoreset mode {mode} is not accepted; an SB3 VecEnv resets within the step (SAME_STEP)")
+        self.env = env
+        self.render_mode = env.render_mode
+        self._actions: NDArray[Any] = np.zeros(0)
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+
+    def reset(self) -> NDArray[Any]:
+        """Reset every environment, with the seeds and options given since the last reset."""
+        seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
+        names = {name for options in self._options for name in options}
+        if any(set(options) != names for options in self._options):
+            raise ValueError(f"every environment needs the same option names; given: {self._options}")
+        options = {name: [row[name] for row in self._options] for name in sorted(names)}
+        observations, infos = self.env.reset(seed=seeds, options=options or None)  # type: ignore[arg-type]
+        self.reset_infos = self._per_row(infos)
+        self._reset_seeds()
+        self._reset_options()
+        return observations
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Keep the actions for :meth:`step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step the batch."""
+        observations, rewards, terminated, truncated, batch = self.env.step(self._actions)
+        dones = terminated | truncated
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for row in np.flatnonzero(dones):
+            infos[row] = {
+                "terminal_observation": batch["final_obs"][row],
+                "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
+                "is_success": bool(batch["is_success"][row]),
+            }
+        return observations, rewards.astype(np.float32), dones, infos
+
+    def close(self) -> None:
+        """Close the batch."""
+        self.env.close()
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """Return the batch's attribute, once per environment asked for."""
+        return [getattr(self.env, attr_name)] * len(self._rows(indices))
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set the batch's attribute."""
+        setattr(self.env, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
+        """Call the batch's method once; its result is returned once per environment asked for."""
+        return [getattr(self.env, method_name)(*args, **kwargs)] * len(self._rows(indices))
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
+    ) -> list[bool]:
+        """A batch has no single-environment wrappers."""
+        return [False] * len(self._rows(indices))
+
+    def _rows(self, indices: VecEnvIndices) -> Sequence[int]:
+        return list(self._get_indices(indices))
+
+    def _per_row(self, infos: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:
+        return [dict(zip(infos, row, strict=True)) for row in zip(*infos.values(), strict=True)] or [
+            {} for _ in range(self.num_envs)
+        ]
+
+
+def make_fast_vec_env(env_id: str, n_envs: int, seed: int | None = None, **env_kwargs: Any) -> VecEnv:
+    """Build the fastest vectorised environment of an id, monitored.
+
+    The batched form is taken where the id has one that resets within the step; otherwise ``n_envs`` environments run
+    in this process, one after the other.
+
+    :param env_id: a registered id, with or without a module prefix
+    :param n_envs: number of environments, at least 1
+    :param seed: environment ``i`` gets ``seed + i``
+    :param env_kwargs: passed to the environment
+    """
+    if n_envs < 1:
+        raise ValueError(f"n_envs={n_envs} is not accepted; it is at least 1")
+    spec = gym.spec(env_id)
+    if spec.vector_entry_point is not None:
+        batch = gym.make_vec(env_id, num_envs=n_envs, vectorization_mode="vector_entry_point", **env_kwargs)
+        if batch.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP:
+            venv: VecEnv = BatchedVecEnv(batch)
+            venv.seed(seed)
+            return VecMonitor(venv)
+        batch.close()
+    return make_vec_env(env_id, n_envs=n_envs, seed=seed, env_kwargs=env_kwargs)
