@@ -48,6 +48,7 @@ class ProgramSampler:
         self._affine = np.ascontiguousarray(np.concatenate((input_weight, _view(controllers.weight))).T)
         self._constant = np.concatenate((input_bias, _view(controllers.bias)))
         self._edges = np.cumsum(self.action.sizes)[:-1]
+        self._mass_sum, self._n_samples = np.zeros(self._n_controllers), 0
 
     def tests(self, gates: Array, hidden: Array, cell: Array) -> tuple[Array, Array, Array]:
         """Return the values of B ``(n_envs, n_conditions)`` and the new states.
@@ -72,6 +73,10 @@ class ProgramSampler:
         np.cumprod(1 - taken, axis=1, out=reached[:, 1:])
         return np.concatenate((taken * reached[:, :-1] * self._at_least, reached * self._probabilities), axis=1)
 
+    def branch_frequencies(self) -> Array:
+        """Return the share of the samples drawn so far that each controller decided, ``(2 depth - 1,)``."""
+        return self._mass_sum / max(1, self._n_samples)
+
     def sample(
         self, inputs: Array, hidden: Array, cell: Array, rng: np.random.Generator
     ) -> tuple[NDArray[Any], Array, Array]:
@@ -86,6 +91,8 @@ class ProgramSampler:
         affine = inputs @ self._affine + self._constant
         tests, hidden, cell = self.tests(affine[:, : self._n_gates], hidden, cell)
         masses = self.masses(tests)
+        self._mass_sum += masses.sum(0)
+        self._n_samples += len(masses)
         outputs = affine[:, self._n_gates :].reshape(len(inputs), self._n_controllers, -1)
         if self.action.kind == "box":
             mean = (masses[:, :, None] * outputs).sum(1)
