@@ -31,7 +31,8 @@ class ProgramSampler:
         self._scale = 1 / float(module.temperature)
         self._n_controllers = module.n_controllers
         self._std = None if log_std is None else np.exp(_view(log_std))
-        self.recurrent = conditions.recurrent
+        self.needs_conditions = module.search.needs_conditions and self.n_conditions > 0
+        self.recurrent = conditions.recurrent and self.needs_conditions
         # Everything that is affine in X in one product: the gates of the conditions, then the controllers.
         if self.recurrent:
             rnn = conditions.rnn
@@ -39,7 +40,7 @@ class ProgramSampler:
             input_weight, input_bias, weight, self._bias = (_view(getattr(rnn, name)) for name in names)
             self._weight = np.ascontiguousarray(weight.T)
             self._readout, self._readout_bias = _view(conditions.readout), _view(conditions.readout_bias)
-        elif self.n_conditions:
+        elif self.needs_conditions:
             input_weight, input_bias = _view(conditions.affine.weight), _view(conditions.affine.bias)
         else:
             input_weight, input_bias = np.zeros((0, module.n_inputs), np.float32), np.zeros(0, np.float32)
@@ -57,6 +58,8 @@ class ProgramSampler:
         :param hidden: ``(n_envs, hidden_size)``
         :param cell: ``(n_envs, hidden_size)``, used by LSTM conditions
         """
+        if not self.needs_conditions:
+            return np.zeros((len(gates), self.n_conditions), dtype=np.float32), hidden, cell
         if not self.recurrent:
             return gates, hidden, cell
         hidden, cell = STEPS[self.cell](gates, hidden @ self._weight + self._bias, hidden, cell)
