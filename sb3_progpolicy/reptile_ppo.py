@@ -498,9 +498,17 @@ class ReptilePPO(PPO):
 
     @th.no_grad()
     def _log_program(self) -> None:
+        """Log W and how often each branch was taken: C'_k is ``branch_then_k``, C_k is ``branch_last_k``."""
+        assert isinstance(self.policy, ProgrammaticActorCritic)
         for n_conditions, probability in enumerate(self.search.probabilities().tolist()):
             self.logger.record(f"program/prob_{n_conditions}_conditions", probability)
         self.logger.record("program/search_entropy", self.search.entropy().item())
+        self.logger.record("program/temperature", self.policy.module.temperature.item())
+        if self._sampler is not None:
+            names = [f"then_{k}" for k in range(1, self.policy.module.depth)]
+            names += [f"last_{k}" for k in range(1, self.policy.module.depth + 1)]
+            for name, share in zip(names, self._sampler.branch_frequencies(), strict=True):
+                self.logger.record(f"program/branch_{name}", share)
 
     # --------------------------------------------------------------------------------------------- the program
 

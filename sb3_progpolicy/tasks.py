@@ -164,8 +164,16 @@ class TaskDistribution:
         self.success_rates[index] = success if smoothing == 1 else old + smoothing * (success - old)
 
     def label(self, index: int) -> str:
-        """Return a short name of a variation for logs, such as ``n_discs=3``."""
-        parts = (f"{name}={'random' if callable(value) else value}" for name, value in self.variations[index].items())
+        """Return a short name of a variation for logs, such as ``n_discs=3``; what all of them share is left out."""
+        variation = self.variations[index]
+        shared = {
+            name
+            for name, value in variation.items()
+            if all(name in other and other[name] == value for other in self.variations)
+        }
+        if len(self) == 1:
+            shared = set()
+        parts = (f"{k}={'drawn' if callable(v) else v}" for k, v in variation.items() if k not in shared)
         return ",".join(parts) or "default"
 
     def put_in_force(self, env: VecEnv, variations: Sequence[Variation]) -> None:

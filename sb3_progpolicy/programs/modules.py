@@ -215,7 +215,10 @@ class ProgramModule(nn.Module):
         :param crisp: run every program as a real if-then-else
         :return: distribution parameters ``(n_steps, n_sequences, n_outputs)`` (see :meth:`mix`) and the new state
         """
-        tests, state = self.conditions(inputs, state)
+        if self.search.needs_conditions:
+            tests, state = self.conditions(inputs, state)
+        else:
+            tests = inputs.new_zeros(*inputs.shape[:-1], self.depth - 1)
         return self.mix(inputs, self.masses(tests, crisp)), state
 
     def initial_state(self, n_sequences: int) -> State:
