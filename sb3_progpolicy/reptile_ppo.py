@@ -66,11 +66,12 @@ class ReptilePPO(PPO):
 
     :param policy: ``"ProgPolicy"``, ``"PRLPolicy"``, ``"MlpPolicy"``, ``"MlpLstmPolicy"`` or a policy class
     :param env: an environment id (the fastest vectorised form is built), an environment or a ``VecEnv``
-    :param learning_rate: of the inner updates (Adam), a number or a schedule of the remaining progress
+    :param learning_rate: of the inner updates (Adam), a number or a schedule of the remaining progress; by default 0.01
+        for a program, which is nearly linear in its parameters and takes large steps, and 0.0003 for a network
     :param n_steps: steps of a rollout, per environment
     :param batch_size: transitions per gradient step; recurrent policies take ``batch_size / n_steps`` whole sequences,
         or, where ``batch_size`` is smaller, sequences of ``batch_size`` steps, which must then divide ``n_steps``. By
-        default a half of the rollout
+        default an eighth of the rollout
     :param n_epochs: passes over a rollout
     :param gamma: discount factor
     :param gae_lambda: of generalised advantage estimation
@@ -117,10 +118,10 @@ class ReptilePPO(PPO):
         self,
         policy: str | type[ActorCriticPolicy],
         env: GymEnv | str | None,
-        learning_rate: float | Schedule = 3e-4,
+        learning_rate: float | Schedule | None = None,
         n_steps: int = 128,
         batch_size: int | None = None,
-        n_epochs: int = 4,
+        n_epochs: int = 10,
         gamma: float = 0.99,
         gae_lambda: float = 0.95,
         clip_range: float | Schedule = 0.2,
@@ -136,11 +137,11 @@ class ReptilePPO(PPO):
         env_kwargs: Mapping[str, Any] | None = None,
         inner_updates: int = 4,
         tasks_per_iteration: int = 4,
-        meta_learning_rate: float | Schedule = 1.0,
+        meta_learning_rate: float | Schedule = 0.5,
         meta_optimizer: MetaOptimizer = "sgd",
         meta_update: bool = True,
         search_fraction: float = 0.5,
-        length_coef: float = 0.0,
+        length_coef: float = 0.005,
         temperature: float | Schedule | None = None,
         interaction_history: bool = True,
         normalize_observations: bool = False,
@@ -163,7 +164,10 @@ class ReptilePPO(PPO):
         if env is not None:
             venv = _with_history(_make_venv(env, n_envs, seed, env_kwargs or {}), interaction_history)
         if batch_size is None:
-            batch_size = max(2, n_steps * (1 if venv is None else venv.num_envs) // 2)
+            batch_size = max(2, n_steps * (1 if venv is None else venv.num_envs) // 8)
+        policy_class = self._get_policy_from_name(policy) if isinstance(policy, str) else policy
+        if learning_rate is None:
+            learning_rate = 1e-2 if issubclass(policy_class, ProgrammaticActorCritic) else 3e-4
         policy_kwargs = dict(policy_kwargs or {})
         if normalize_observations:
             policy_kwargs.setdefault("features_extractor_class", NormalizingExtractor)
