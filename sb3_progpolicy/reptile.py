@@ -98,6 +98,10 @@ class ReptileWrapper(BaseCallback):
             )
         self.set_up(self.model)
 
+    def _on_training_start(self) -> None:
+        # SB3 does so after the first rollout only; until then a model trained before would still be at its end.
+        self.model._update_current_progress_remaining(self.model.num_timesteps, max(1, self.model._total_timesteps))
+
     def _on_rollout_start(self) -> None:
         if self._inner_update == self.inner_updates:
             self._finish_task()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 import pathlib
-import tempfile
+import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, TypeVar, cast
 
@@ -17,7 +17,7 @@ from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from sb3_contrib.ppo_recurrent import MlpLstmPolicy
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.torch_layers import FlattenExtractor
@@ -25,7 +25,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
 
-from sb3_progpolicy.interaction import VecInteractionHistory, program_names
+from sb3_progpolicy.interaction import InteractionHistory, VecInteractionHistory, program_names
 from sb3_progpolicy.normalization import NormalizingExtractor, RewardScaler
 from sb3_progpolicy.policies import (
     DERIVATION_LR_SCALE,
@@ -259,11 +259,12 @@ class ReptilePPO(PPO):
         return self.policy.module.search if isinstance(self.policy, ProgrammaticActorCritic) else None
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        given = super()._init_callback(callback, progress_bar)
+        if isinstance(callback, list):
+            callback = CallbackList(callback)
+        if not isinstance(callback, BaseCallback):
+            callback = ConvertCallback(callback)
         # Reptile first: it finishes a task before anyone else, a checkpoint say, looks at the parameters.
-        callbacks = CallbackList([self.reptile, given])
-        callbacks.init_callback(self)
-        return callbacks
+        return super()._init_callback([self.reptile, callback], progress_bar)
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         super()._update_learning_rate(optimizers)
@@ -330,7 +331,7 @@ class ReptilePPO(PPO):
     def _act(self, buffer: RolloutBuffer, step: int) -> np.ndarray:
         """Draw actions ``(n_envs, *action_shape)`` and advance the recurrent states."""
         if self._sampler is not None:
-            features = cast(np.ndarray, self._last_obs)
+            features = np.asarray(self._last_obs, dtype=np.float32)
             if isinstance(self.policy.features_extractor, NormalizingExtractor):
                 features = self.policy.features_extractor(th.as_tensor(features)).numpy()
             hidden, cell = (state[0].numpy() for state in self._program_states())
@@ -338,7 +339,7 @@ class ReptilePPO(PPO):
             if self.recurrent:
                 states = th.from_numpy(hidden)[None], th.from_numpy(cell)[None]
                 self._last_lstm_states = RNNStates(states, states)
-            return actions
+            return actions.reshape(self.n_envs, *self.action_space.shape)  # type: ignore[misc]
         obs = obs_as_tensor(self._last_obs, self.device)  # type: ignore[arg-type]
         if self.recurrent:
             starts = th.zeros(self.n_envs, device=self.device)  # states survive the end of an episode
@@ -393,7 +394,9 @@ class ReptilePPO(PPO):
         searching = self.search is not None and self.search.searching and len(self.search.logits)
         rollout = self._sequences()
         statistics: list[th.Tensor] = []
-        for gradient_step, sequences in enumerate(self._minibatches(len(rollout["advantages"]))):
+        # The count goes on from update to update, so that both have their turns where an update is a single step.
+        minibatches = self._minibatches(len(rollout["advantages"]))
+        for gradient_step, sequences in enumerate(minibatches, start=self._n_updates):
             if searching:
                 self._freeze(derivation=gradient_step % 2 == 1)
             loss, measured = self._loss(rollout, sequences, clip_range)
@@ -529,6 +532,25 @@ class ReptilePPO(PPO):
             self.input_names, self.output_names, self.interaction_history, **{**origin, **metadata}
         )
 
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Return actions, as the environment takes them, and the next state. See SB3's ``BaseAlgorithm.predict``.
+
+        :param observation: with the interaction history, if the policy was trained with it
+        :param state: of a recurrent policy; ``None`` at the start of a task, which reads as zeros
+        :param episode_start: changes nothing: states survive the end of an episode, as in training (section 2.4)
+        :param deterministic: take the likeliest action, or the mean, instead of drawing one
+        """
+        actions, state = super().predict(observation, state, None, deterministic)
+        if isinstance(self.action_space, spaces.Discrete):
+            actions = actions + self.action_space.start
+        return actions, state
+
     # ------------------------------------------------------------------------------------------ learn and save
 
     def learn(
@@ -592,13 +614,12 @@ class ReptilePPO(PPO):
         path = pathlib.Path(path)
         path = path if path.suffix else path.with_suffix(".zip")
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=".partial")
-        os.close(handle)
+        temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.partial")
         try:
             super().save(temporary, exclude, include)
             os.replace(temporary, path)
         finally:
-            pathlib.Path(temporary).unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
 
 
 class _Reptile(ReptileWrapper):
@@ -611,6 +632,9 @@ class _Reptile(ReptileWrapper):
         over = 1 - model._current_progress_remaining >= model.search_fraction
         if model.search is not None and model.search.searching and over:
             model.search.select(model.search.most_likely())
+            # The momentum of a meta-optimizer would move W on.
+            assert self.meta_optimizer is not None
+            self.meta_optimizer.state.pop(model.search.logits, None)
         if model.reward_scaler is not None:
             model.reward_scaler.forget_returns()
         super()._begin_task()
@@ -625,6 +649,11 @@ def _make_venv(env: GymEnv | str, n_envs: int | None, seed: int | None, env_kwar
 
 
 def _with_history(venv: VecEnv, interaction_history: bool) -> VecEnv:
+    if interaction_history and any(venv.env_is_wrapped(InteractionHistory)):
+        raise ValueError(
+            "an environment wrapped in InteractionHistory is not accepted; ReptilePPO appends the history itself. "
+            "Give it the environment without the wrapper, or interaction_history=False"
+        )
     if interaction_history and not is_vecenv_wrapped(venv, VecInteractionHistory):
         return VecInteractionHistory(venv)
     return venv

@@ -15,10 +15,9 @@ from sb3_progpolicy.programs.modules import ProgramModule
 class ProgramSampler:
     """Runs a :class:`ProgramModule` one step at a time for a batch of environments and samples actions.
 
-    It reads the module's parameters in place (they have to be on the CPU) and computes what the module computes
-    under the soft semantics, W included.
+    It computes what the module computes under the soft semantics, W included.
 
-    :param module: the program mixture; W and the temperature are read now, the rest at each step
+    :param module: the program mixture, on the CPU; its parameters are read now: one sampler for each rollout
     :param log_std: logarithm of the standard deviations of Box actions, ``(n_outputs,)``
     """
 
