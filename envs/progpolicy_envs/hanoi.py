@@ -56,7 +56,7 @@ def _peg_pairs(variation: Variation) -> list[tuple[int, int]]:
 
 def _draw_pegs(pairs: list[tuple[int, int]], rng: np.random.Generator) -> tuple[int, int]:
     """Draw source and target of an episode."""
-    return pairs[int(rng.integers(len(pairs)))] if len(pairs) > 1 else pairs[0]
+    return pairs[int(len(pairs) * rng.random())] if len(pairs) > 1 else pairs[0]
 
 
 class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
@@ -308,12 +308,12 @@ class HanoiVectorEnv(PlanningVectorEnv):
 
     def _place_pegs(self, rows: NDArray[np.intp]) -> None:
         """Read or draw source and target, and colour the bases with them."""
-        if not rows.size:
-            return
-        pegs = np.array([_draw_pegs(self._pairs[row], self._generators[row]) for row in rows])
-        self._source[rows], self._target[rows] = pegs.T
-        continues = (np.arange(N_PEGS) == pegs[:, :1]) | (np.arange(N_PEGS) == pegs[:, 1:])
-        self._bases[rows] = ((self._n_discs[rows, None] + ~continues) % 2) @ (1 << np.arange(N_PEGS))
+        for row in rows:
+            source, target = _draw_pegs(self._pairs[row], self._generators[row])
+            self._source[row], self._target[row] = source, target
+            # Bit per peg: source and target continue the alternation of n discs, the third base does not.
+            continued = (1 << source) | (1 << target)
+            self._bases[row] = continued if self._n_discs[row] % 2 else 2**N_PEGS - 1 - continued
 
     def _reset_rows(self, rows: NDArray[np.intp]) -> None:
         self._place_pegs(rows[self._random[rows]])
