@@ -1,19 +1,60 @@
 """Learn a readable program instead of a black box: programmatic policies and Reptile for Stable-Baselines3."""
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 import progpolicy_envs  # registers the environments
-from sb3_progpolicy.interaction import InteractionHistory, VecInteractionHistory
-from sb3_progpolicy.policies import ProgrammaticPolicy, RecurrentProgrammaticPolicy
-from sb3_progpolicy.reptile import ReptileWrapper
-from sb3_progpolicy.reptile_ppo import ReptilePPO
-from sb3_progpolicy.tasks import TaskDistribution
+
+if TYPE_CHECKING:
+    from sb3_progpolicy.checkpoint import ReptileCheckpoint
+    from sb3_progpolicy.evaluation import Evaluation, evaluate_model, evaluate_program
+    from sb3_progpolicy.interaction import InteractionHistory, VecInteractionHistory
+    from sb3_progpolicy.policies import ProgrammaticPolicy, RecurrentProgrammaticPolicy
+    from sb3_progpolicy.pretrained import load_pretrained, pretrained_names
+    from sb3_progpolicy.reptile import ReptileWrapper
+    from sb3_progpolicy.reptile_ppo import ReptilePPO
+    from sb3_progpolicy.tasks import TaskDistribution
+
+# Modules are imported when a name is first used: reading and running a program needs no torch.
+_MODULES = {
+    "Evaluation": "evaluation",
+    "InteractionHistory": "interaction",
+    "ProgrammaticPolicy": "policies",
+    "RecurrentProgrammaticPolicy": "policies",
+    "ReptileCheckpoint": "checkpoint",
+    "ReptilePPO": "reptile_ppo",
+    "ReptileWrapper": "reptile",
+    "TaskDistribution": "tasks",
+    "VecInteractionHistory": "interaction",
+    "evaluate_model": "evaluation",
+    "evaluate_program": "evaluation",
+    "load_pretrained": "pretrained",
+    "pretrained_names": "pretrained",
+}
 
 __all__ = [
+    "Evaluation",
     "InteractionHistory",
     "ProgrammaticPolicy",
     "RecurrentProgrammaticPolicy",
+    "ReptileCheckpoint",
     "ReptilePPO",
     "ReptileWrapper",
     "TaskDistribution",
     "VecInteractionHistory",
+    "evaluate_model",
+    "evaluate_program",
+    "load_pretrained",
+    "pretrained_names",
     "progpolicy_envs",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -80,6 +80,11 @@ class ReptileWrapper(BaseCallback):
         self._successes: dict[int, list[float]] = defaultdict(list)
         self._lengths: dict[int, list[float]] = defaultdict(list)
 
+    @property
+    def at_task_start(self) -> bool:
+        """Whether the rollout that starts is a task's first, so that the parameters are theta."""
+        return self._inner_update == 1
+
     def set_up(self, model: OnPolicyAlgorithm) -> None:
         """Make the meta-optimizer for the parameters of ``model``, unless there is one."""
         if self.meta_optimizer is None:

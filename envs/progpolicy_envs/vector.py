@@ -109,6 +109,10 @@ class PlanningVectorEnv(VectorEnv, ABC):
             observations = self._observe()
         return observations, rewards, terminated, truncated, infos
 
+    def optimal_steps(self) -> NDArray[np.int64]:
+        """Return how many steps the planner needs from each environment's present state, ``(num_envs,)``."""
+        return self._optimal_steps()
+
     @abstractmethod
     def _reset_rows(self, rows: NDArray[np.intp]) -> None:
         """Put the given environments into a starting state of their variation."""

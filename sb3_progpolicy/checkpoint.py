@@ -1,0 +1,68 @@
+"""Checkpoints of ReptilePPO from which training goes on as if it had never stopped."""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_progpolicy.programs.files import write_atomically
+
+if TYPE_CHECKING:
+    from sb3_progpolicy.reptile_ppo import ReptilePPO
+
+
+class ReptileCheckpoint(BaseCallback):
+    """Saves a :class:`~sb3_progpolicy.reptile_ppo.ReptilePPO` model at meta-iteration boundaries.
+
+    Between two tasks the parameters are theta, and everything random in the next task follows from the seed and its
+    number. So a model loaded from there and trained on with ``reset_num_timesteps=False`` ends with the parameters, to
+    the last bit, of a model that was never stopped; it needs a ``seed`` for that.
+
+    :param path: the file to write, replaced only when the new one is complete
+    :param save_freq: environment steps between two checkpoints, at least; 0 for every boundary
+    :param verbose: 0 or 1
+    :raises ValueError: if ``save_freq`` is negative
+    """
+
+    model: ReptilePPO
+
+    def __init__(self, path: str | os.PathLike[str], save_freq: int = 0, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        if save_freq < 0:
+            raise ValueError(f"save_freq={save_freq} is not accepted; it is at least 0")
+        self.path, self.save_freq = Path(path), save_freq
+        self._boundary: bytes | None = None
+        self._next_save = save_freq
+
+    def save(self) -> bool:
+        """Write the last boundary, also when training was interrupted in the middle of a task.
+
+        :return: whether there was one to write
+        """
+        if self._boundary is None:
+            return False
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(self.path, self._boundary)
+        return True
+
+    def _on_training_start(self) -> None:
+        self._next_save = self.num_timesteps + self.save_freq
+
+    def _on_rollout_start(self) -> None:
+        if not self.model.reptile.at_task_start:
+            return
+        buffer = io.BytesIO()
+        self.model.save(buffer)
+        self._boundary = buffer.getvalue()
+        if self.num_timesteps >= self._next_save:
+            self.save()
+            self._next_save = self.num_timesteps + self.save_freq
+            if self.verbose:
+                print(f"Checkpoint of meta-iteration {self.model.meta_iteration}: {self.path}")
+
+    def _on_step(self) -> bool:
+        return True

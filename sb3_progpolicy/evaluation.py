@@ -1,0 +1,255 @@
+"""How well a program or a model does on variations of a domain: success, steps, and the planner's steps."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_progpolicy.interaction import VecInteractionHistory, action_spec, interaction_space
+from sb3_progpolicy.nearest import unknown
+from sb3_progpolicy.programs.interpreter import ProgramRunner, Semantics, join_inputs
+from sb3_progpolicy.programs.syntax import Program
+from sb3_progpolicy.vec_env import BatchedVecEnv, make_fast_vec_env
+
+Act = Callable[[NDArray[Any], NDArray[np.float32], NDArray[np.bool_]], NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Results on one variation.
+
+    :param env: environment id
+    :param variation: the parameters that were set
+    :param episodes: number of episodes
+    :param success_rate: share of them that reached the goal, 0 to 1
+    :param steps_mean: mean steps to the goal; an episode that fails counts as the cap, as in the paper
+    :param steps_std: their standard deviation
+    :param optimal_steps_mean: mean steps of the domain's planner on the same episodes; ``None`` where there is none
+    :param semantics: ``"soft"`` or ``"crisp"``; ``None`` for a model that is not a program
+    """
+
+    env: str
+    variation: Mapping[str, Any]
+    episodes: int
+    success_rate: float
+    steps_mean: float
+    steps_std: float
+    optimal_steps_mean: float | None
+    semantics: Semantics | None
+
+    @property
+    def ratio(self) -> float | None:
+        """Steps as a multiple of the planner's, 1 at best; ``None`` where there is no planner."""
+        return self.steps_mean / self.optimal_steps_mean if self.optimal_steps_mean else None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as JSON values."""
+        return dataclasses.asdict(self)
+
+
+def evaluate_program(
+    program: Program,
+    env_id: str | None = None,
+    variations: Sequence[Mapping[str, Any]] = ({},),
+    n_episodes: int = 1,
+    semantics: Semantics = "crisp",
+    seed: int = 0,
+    max_steps: int | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+) -> list[Evaluation]:
+    """Run a program on variations of an environment.
+
+    Its memory is zero at the start of a variation, which is a task, and is kept across the episodes of that variation
+    (section 2.4).
+
+    :param program: what to evaluate
+    :param env_id: environment id; by default the one in the program's metadata
+    :param variations: parameters to set, one mapping for each row of the result
+    :param n_episodes: episodes on each variation, at least 1
+    :param semantics: ``"crisp"`` or ``"soft"``
+    :param seed: variation ``i`` is seeded with ``seed + i``
+    :param max_steps: cap of an episode in place of the registered one
+    :param env_kwargs: constructor arguments common to all variations
+    :return: one row for each variation
+    :raises ValueError: if an argument is not accepted or the program does not fit the environment
+    """
+    env_id = env_id or program.metadata.get("env")
+    if not env_id:
+        raise ValueError("the program does not say which environment it is for; give env_id")
+
+    def start(venv: VecEnv) -> Act:
+        spec, n_observations = action_spec(venv.action_space), int(np.prod(venv.observation_space.shape or ()))
+        if (spec, n_observations) != (program.action, program.n_observations):
+            raise ValueError(
+                f"the program reads {program.n_observations} numbers and acts in {program.action.kind} "
+                f"{list(program.action.sizes)}; {env_id} has {n_observations} numbers and {spec.kind} "
+                f"{list(spec.sizes)}"
+            )
+        runner = ProgramRunner(program, venv.num_envs, semantics)
+        previous: NDArray[Any] | None = None
+
+        def act(observations: NDArray[Any], rewards: NDArray[np.float32], dones: NDArray[np.bool_]) -> NDArray[Any]:
+            nonlocal previous
+            previous = runner.act(join_inputs(program, observations, previous, rewards, dones))
+            return previous
+
+        return act
+
+    return _evaluate(env_id, variations, n_episodes, semantics, seed, max_steps, env_kwargs, lambda venv: venv, start)
+
+
+def evaluate_model(
+    model: BaseAlgorithm,
+    env_id: str,
+    variations: Sequence[Mapping[str, Any]] = ({},),
+    n_episodes: int = 1,
+    seed: int = 0,
+    max_steps: int | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+) -> list[Evaluation]:
+    """Run any SB3 model on variations of an environment, with its most likely actions.
+
+    The state of a recurrent policy is zero at the start of a variation. It is kept across episodes where the model was
+    trained so (:class:`~sb3_progpolicy.reptile_ppo.ReptilePPO`). A model whose observation space has room for the
+    interaction history is given it.
+
+    See :func:`evaluate_program` for the other arguments.
+    """
+    keeps_state = bool(getattr(model, "interaction_history", False))
+
+    def prepare(venv: VecEnv) -> VecEnv:
+        assert model.observation_space is not None
+        if venv.observation_space.shape == model.observation_space.shape:
+            return venv
+        joined = interaction_space(venv.observation_space, action_spec(venv.action_space))
+        if joined.shape != model.observation_space.shape:
+            raise ValueError(
+                f"the model reads observations {model.observation_space.shape}; {env_id} has "
+                f"{venv.observation_space.shape}, or {joined.shape} with the interaction history"
+            )
+        return VecInteractionHistory(venv)
+
+    def start(venv: VecEnv) -> Act:
+        state: Any = None
+
+        def act(observations: NDArray[Any], rewards: NDArray[np.float32], dones: NDArray[np.bool_]) -> NDArray[Any]:
+            nonlocal state
+            starts = np.zeros_like(dones) if keeps_state else dones
+            actions, state = model.predict(observations, state, starts, deterministic=True)
+            return actions
+
+        return act
+
+    return _evaluate(env_id, variations, n_episodes, None, seed, max_steps, env_kwargs, prepare, start)
+
+
+def _evaluate(
+    env_id: str,
+    variations: Sequence[Mapping[str, Any]],
+    n_episodes: int,
+    semantics: Semantics | None,
+    seed: int,
+    max_steps: int | None,
+    env_kwargs: Mapping[str, Any] | None,
+    prepare: Callable[[VecEnv], VecEnv],
+    start: Callable[[VecEnv], Act],
+) -> list[Evaluation]:
+    if n_episodes < 1:
+        raise ValueError(f"n_episodes={n_episodes} is not accepted; it is at least 1")
+    spec = spec_of(env_id)
+    cap = max_steps if max_steps is not None else spec.max_episode_steps
+    if cap is None or cap < 1:
+        raise ValueError(f"max_steps={max_steps} is not accepted; {env_id} needs a cap on steps of at least 1")
+    rows: list[Evaluation] = []
+    for group in _groups(variations, batched=spec.vector_entry_point is not None):
+        first = len(rows)
+        venv = prepare(make_fast_vec_env(env_id, len(group), max_episode_steps=cap, **(env_kwargs or {})))
+        try:
+            success, steps, optimal = _play(venv, group, n_episodes, seed + first, cap, start(venv))
+        finally:
+            venv.close()
+        rows += [
+            Evaluation(
+                env=env_id,
+                variation=dict(variation),
+                episodes=n_episodes,
+                success_rate=float(success[row].mean()),
+                steps_mean=float(steps[row].mean()),
+                steps_std=float(steps[row].std()),
+                optimal_steps_mean=None if np.isnan(optimal[row]).any() else float(optimal[row].mean()),
+                semantics=semantics,
+            )
+            for row, variation in enumerate(group)
+        ]
+    return rows
+
+
+def _groups(variations: Sequence[Mapping[str, Any]], batched: bool) -> Iterator[list[Mapping[str, Any]]]:
+    """Split into runs to be stepped together: alone, or, since a batch costs the same for all, by equal names."""
+    if not batched:
+        yield from ([variation] for variation in variations)
+        return
+    for _, group in groupby(variations, key=set):
+        yield list(group)
+
+
+def _play(
+    venv: VecEnv, variations: Sequence[Mapping[str, Any]], n_episodes: int, seed: int, cap: int, act: Act
+) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+    """Play ``n_episodes`` in every environment; return successes, steps, the planner's steps ``(n_envs, n_episodes)``.
+
+    An environment that has played its episodes goes on, unrecorded, until the last has.
+    """
+    n_envs = venv.num_envs
+    success = np.zeros((n_envs, n_episodes), dtype=bool)
+    steps = np.full((n_envs, n_episodes), float(cap))
+    optimal = np.full((n_envs, n_episodes), np.nan)
+    venv.seed(seed)
+    venv.set_options([dict(variation) for variation in variations])
+    observations: Any = venv.reset()
+    optimal[:, 0] = _optimal_steps(venv)
+    rewards, dones = np.zeros(n_envs, dtype=np.float32), np.zeros(n_envs, dtype=bool)
+    finished, elapsed = np.zeros(n_envs, dtype=np.int64), np.zeros(n_envs, dtype=np.int64)
+    while (finished < n_episodes).any():
+        observations, rewards, dones, infos = venv.step(act(observations, rewards, dones))
+        elapsed += 1
+        ended = np.flatnonzero(dones & (finished < n_episodes))
+        for row in ended:
+            if "is_success" not in infos[row]:
+                raise ValueError("the environment does not report is_success; use SB3's evaluate_policy for its return")
+            if infos[row]["is_success"]:
+                success[row, finished[row]], steps[row, finished[row]] = True, elapsed[row]
+        finished[ended] += 1
+        elapsed[dones] = 0
+        if going_on := [row for row in ended if finished[row] < n_episodes]:
+            planned = _optimal_steps(venv)
+            optimal[going_on, finished[going_on]] = planned[going_on]
+    return success, steps, optimal
+
+
+def _optimal_steps(venv: VecEnv) -> NDArray[np.float64]:
+    """The planner's steps from the states in which episodes have just begun; meaningless in the middle of one."""
+    if isinstance(venv.unwrapped, BatchedVecEnv):
+        return np.asarray(venv.env_method("optimal_steps")[0], dtype=np.float64)
+    infos = venv.unwrapped.reset_infos  # SB3's wrappers do not pass them on
+    return np.array([info.get("optimal_steps", np.nan) for info in infos], dtype=np.float64)
+
+
+def spec_of(env_id: str) -> Any:
+    """Return the registered specification of an environment id.
+
+    :raises ValueError: if there is none; the message names the nearest ids
+    """
+    try:
+        return gym.spec(env_id)
+    except (gym.error.Error, ModuleNotFoundError):
+        raise unknown("environment", env_id, gym.registry) from None
