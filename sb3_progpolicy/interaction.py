@@ -22,7 +22,7 @@ def action_spec(space: spaces.Space[Any]) -> ActionSpec:
     """
     if isinstance(space, spaces.Discrete):
         return ActionSpec("discrete", (int(space.n),), start=int(space.start))
-    if isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim == 1:
+    if isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim == 1 and not space.start.any():
         return ActionSpec("multi_discrete", tuple(int(n) for n in space.nvec))
     if isinstance(space, spaces.MultiBinary) and isinstance(space.n, (int, np.integer)):
         return ActionSpec("multi_binary", (int(space.n),))
@@ -30,8 +30,8 @@ def action_spec(space: spaces.Space[Any]) -> ActionSpec:
         low, high = (tuple(bound.astype(float).ravel().tolist()) for bound in (space.low, space.high))
         return ActionSpec("box", (len(low),), low=low, high=high)
     raise ValueError(
-        f"action space {space} is not accepted; programs act in Discrete, Box, one-dimensional MultiDiscrete "
-        "and MultiBinary spaces"
+        f"action space {space} is not accepted; programs act in Discrete, Box and one-dimensional MultiDiscrete "
+        "(starting at 0) and MultiBinary spaces"
     )
 
 
@@ -82,7 +82,8 @@ class InteractionHistory(gym.ObservationWrapper[NDArray[np.float32], Any, Any], 
     """Append the previous action, reward and done flag to the observation of one environment (section 2.4).
 
     They survive the end of an episode: the first observation of the next one shows the last action and reward and a
-    done flag of 1. They are zero before the first action and after :meth:`forget`, or a reset with a variation.
+    done flag of 1. They are zero before the first action, after :meth:`forget`, and after a reset with a seed or a
+    variation.
 
     :param env: an environment with one-dimensional Box observations
     :raises ValueError: if a space is not accepted
@@ -102,8 +103,8 @@ class InteractionHistory(gym.ObservationWrapper[NDArray[np.float32], Any, Any], 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start an episode; given ``options``, a new task too, which zeroes the history."""
-        if options:
+        """Start an episode; given ``seed`` or ``options``, a new task too, which zeroes the history."""
+        if options or seed is not None:
             self.forget()
         return super().reset(seed=seed, options=options)
 

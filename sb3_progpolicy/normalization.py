@@ -12,6 +12,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from sb3_progpolicy.programs.modules import ProgramModule
 
 EPSILON = 1e-8
+CLIP_REWARD = 10.0  # as VecNormalize's; until the statistics have settled, a scaled reward can be anything
 
 
 class NormalizingExtractor(BaseFeaturesExtractor):
@@ -84,7 +85,7 @@ class RewardScaler:
         self._returns: NDArray[np.float64] = np.zeros(0)
 
     def __call__(self, rewards: NDArray[np.floating], dones: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Take in the rewards of one step and return them scaled.
+        """Take in the rewards of one step and return them scaled, within -10 and 10.
 
         :param rewards: ``(n_envs,)``
         :param dones: ``(n_envs,)``, whether the episode ended with this step
@@ -94,7 +95,8 @@ class RewardScaler:
         self._returns = self._returns * self.gamma + rewards
         self.statistics.update(self._returns)
         self._returns[dones] = 0
-        return (rewards / np.sqrt(self.statistics.var + EPSILON)).astype(np.float32)
+        scaled = rewards / np.sqrt(self.statistics.var + EPSILON)
+        return np.clip(scaled, -CLIP_REWARD, CLIP_REWARD).astype(np.float32)
 
     def forget_returns(self) -> None:
         """Start the running returns anew, as at a task switch; the statistics stay."""

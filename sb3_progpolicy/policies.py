@@ -215,6 +215,8 @@ class RecurrentProgrammaticPolicy(ProgrammaticActorCritic, RecurrentActorCriticP
         self, features: th.Tensor, states: tuple[th.Tensor, ...], episode_starts: th.Tensor
     ) -> tuple[th.Tensor, State]:
         """Run the conditions over sequences laid out one after the other, as RecurrentPPO's batches are."""
+        if not self.module.search.needs_conditions:
+            return features.new_zeros(len(features), self.module.depth - 1), cast(State, states)
         if not self.reset_state_at_episode_start:
             episode_starts = th.zeros_like(episode_starts)
         conditions = cast(nn.LSTM, self.module.conditions)  # called alike

@@ -41,7 +41,8 @@ class ReptileWrapper(BaseCallback):
     :param tasks_per_iteration: tasks drawn for a meta-iteration, dealt out over the environments. 1 is algorithm 1 as
         printed; with more, each inner update follows the mean gradient over several tasks, so that it cannot specialise
         on one of them. At most one task per environment
-    :param meta_learning_rate: beta, a number or a schedule of the remaining progress (1 to 0)
+    :param meta_learning_rate: beta, a number or a schedule of the remaining progress (1 to 0); with plain SGD, 1 takes
+        over theta_hat as it is and is no different from leaving the meta-step out
     :param meta_optimizer: ``"sgd"`` for the plain step, ``"adam"``
     :param meta_update: ``False`` leaves the meta-step out, so that training just goes on from task to task (PPO-N)
     :param verbose: 0 or 1
@@ -55,7 +56,7 @@ class ReptileWrapper(BaseCallback):
         tasks: TaskDistribution,
         inner_updates: int = 4,
         tasks_per_iteration: int = 1,
-        meta_learning_rate: float | Schedule = 1.0,
+        meta_learning_rate: float | Schedule = 0.5,
         meta_optimizer: MetaOptimizer = "sgd",
         meta_update: bool = True,
         verbose: int = 0,
@@ -96,6 +97,10 @@ class ReptileWrapper(BaseCallback):
                 f"{type(self.model).__name__} is not accepted; ReptileWrapper runs with on-policy algorithms"
             )
         self.set_up(self.model)
+
+    def _on_training_start(self) -> None:
+        # SB3 does so after the first rollout only; until then a model trained before would still be at its end.
+        self.model._update_current_progress_remaining(self.model.num_timesteps, max(1, self.model._total_timesteps))
 
     def _on_rollout_start(self) -> None:
         if self._inner_update == self.inner_updates:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 import pathlib
-import tempfile
+import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, TypeVar, cast
 
@@ -17,7 +17,7 @@ from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from sb3_contrib.ppo_recurrent import MlpLstmPolicy
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.torch_layers import FlattenExtractor
@@ -25,7 +25,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
 
-from sb3_progpolicy.interaction import VecInteractionHistory, program_names
+from sb3_progpolicy.interaction import InteractionHistory, VecInteractionHistory, program_names
 from sb3_progpolicy.normalization import NormalizingExtractor, RewardScaler
 from sb3_progpolicy.policies import (
     DERIVATION_LR_SCALE,
@@ -66,11 +66,12 @@ class ReptilePPO(PPO):
 
     :param policy: ``"ProgPolicy"``, ``"PRLPolicy"``, ``"MlpPolicy"``, ``"MlpLstmPolicy"`` or a policy class
     :param env: an environment id (the fastest vectorised form is built), an environment or a ``VecEnv``
-    :param learning_rate: of the inner updates (Adam), a number or a schedule of the remaining progress
+    :param learning_rate: of the inner updates (Adam), a number or a schedule of the remaining progress; by default 0.01
+        for a program, which is nearly linear in its parameters and takes large steps, and 0.0003 for a network
     :param n_steps: steps of a rollout, per environment
     :param batch_size: transitions per gradient step; recurrent policies take ``batch_size / n_steps`` whole sequences,
         or, where ``batch_size`` is smaller, sequences of ``batch_size`` steps, which must then divide ``n_steps``. By
-        default a half of the rollout
+        default an eighth of the rollout
     :param n_epochs: passes over a rollout
     :param gamma: discount factor
     :param gae_lambda: of generalised advantage estimation
@@ -117,10 +118,10 @@ class ReptilePPO(PPO):
         self,
         policy: str | type[ActorCriticPolicy],
         env: GymEnv | str | None,
-        learning_rate: float | Schedule = 3e-4,
+        learning_rate: float | Schedule | None = None,
         n_steps: int = 128,
         batch_size: int | None = None,
-        n_epochs: int = 4,
+        n_epochs: int = 10,
         gamma: float = 0.99,
         gae_lambda: float = 0.95,
         clip_range: float | Schedule = 0.2,
@@ -136,11 +137,11 @@ class ReptilePPO(PPO):
         env_kwargs: Mapping[str, Any] | None = None,
         inner_updates: int = 4,
         tasks_per_iteration: int = 4,
-        meta_learning_rate: float | Schedule = 1.0,
+        meta_learning_rate: float | Schedule = 0.5,
         meta_optimizer: MetaOptimizer = "sgd",
         meta_update: bool = True,
         search_fraction: float = 0.5,
-        length_coef: float = 0.0,
+        length_coef: float = 0.005,
         temperature: float | Schedule | None = None,
         interaction_history: bool = True,
         normalize_observations: bool = False,
@@ -163,7 +164,10 @@ class ReptilePPO(PPO):
         if env is not None:
             venv = _with_history(_make_venv(env, n_envs, seed, env_kwargs or {}), interaction_history)
         if batch_size is None:
-            batch_size = max(2, n_steps * (1 if venv is None else venv.num_envs) // 2)
+            batch_size = max(2, n_steps * (1 if venv is None else venv.num_envs) // 8)
+        policy_class = self._get_policy_from_name(policy) if isinstance(policy, str) else policy
+        if learning_rate is None:
+            learning_rate = 1e-2 if issubclass(policy_class, ProgrammaticActorCritic) else 3e-4
         policy_kwargs = dict(policy_kwargs or {})
         if normalize_observations:
             policy_kwargs.setdefault("features_extractor_class", NormalizingExtractor)
@@ -255,11 +259,12 @@ class ReptilePPO(PPO):
         return self.policy.module.search if isinstance(self.policy, ProgrammaticActorCritic) else None
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        given = super()._init_callback(callback, progress_bar)
+        if isinstance(callback, list):
+            callback = CallbackList(callback)
+        if not isinstance(callback, BaseCallback):
+            callback = ConvertCallback(callback)
         # Reptile first: it finishes a task before anyone else, a checkpoint say, looks at the parameters.
-        callbacks = CallbackList([self.reptile, given])
-        callbacks.init_callback(self)
-        return callbacks
+        return super()._init_callback([self.reptile, callback], progress_bar)
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         super()._update_learning_rate(optimizers)
@@ -326,7 +331,7 @@ class ReptilePPO(PPO):
     def _act(self, buffer: RolloutBuffer, step: int) -> np.ndarray:
         """Draw actions ``(n_envs, *action_shape)`` and advance the recurrent states."""
         if self._sampler is not None:
-            features = cast(np.ndarray, self._last_obs)
+            features = np.asarray(self._last_obs, dtype=np.float32)
             if isinstance(self.policy.features_extractor, NormalizingExtractor):
                 features = self.policy.features_extractor(th.as_tensor(features)).numpy()
             hidden, cell = (state[0].numpy() for state in self._program_states())
@@ -334,7 +339,7 @@ class ReptilePPO(PPO):
             if self.recurrent:
                 states = th.from_numpy(hidden)[None], th.from_numpy(cell)[None]
                 self._last_lstm_states = RNNStates(states, states)
-            return actions
+            return actions.reshape(self.n_envs, *self.action_space.shape)  # type: ignore[misc]
         obs = obs_as_tensor(self._last_obs, self.device)  # type: ignore[arg-type]
         if self.recurrent:
             starts = th.zeros(self.n_envs, device=self.device)  # states survive the end of an episode
@@ -389,7 +394,9 @@ class ReptilePPO(PPO):
         searching = self.search is not None and self.search.searching and len(self.search.logits)
         rollout = self._sequences()
         statistics: list[th.Tensor] = []
-        for gradient_step, sequences in enumerate(self._minibatches(len(rollout["advantages"]))):
+        # The count goes on from update to update, so that both have their turns where an update is a single step.
+        minibatches = self._minibatches(len(rollout["advantages"]))
+        for gradient_step, sequences in enumerate(minibatches, start=self._n_updates):
             if searching:
                 self._freeze(derivation=gradient_step % 2 == 1)
             loss, measured = self._loss(rollout, sequences, clip_range)
@@ -498,9 +505,17 @@ class ReptilePPO(PPO):
 
     @th.no_grad()
     def _log_program(self) -> None:
+        """Log W and how often each branch was taken: C'_k is ``branch_then_k``, C_k is ``branch_last_k``."""
+        assert isinstance(self.policy, ProgrammaticActorCritic)
         for n_conditions, probability in enumerate(self.search.probabilities().tolist()):
             self.logger.record(f"program/prob_{n_conditions}_conditions", probability)
         self.logger.record("program/search_entropy", self.search.entropy().item())
+        self.logger.record("program/temperature", self.policy.module.temperature.item())
+        if self._sampler is not None:
+            names = [f"then_{k}" for k in range(1, self.policy.module.depth)]
+            names += [f"last_{k}" for k in range(1, self.policy.module.depth + 1)]
+            for name, share in zip(names, self._sampler.branch_frequencies(), strict=True):
+                self.logger.record(f"program/branch_{name}", share)
 
     # --------------------------------------------------------------------------------------------- the program
 
@@ -516,6 +531,25 @@ class ReptilePPO(PPO):
         return self.policy.program(
             self.input_names, self.output_names, self.interaction_history, **{**origin, **metadata}
         )
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Return actions, as the environment takes them, and the next state. See SB3's ``BaseAlgorithm.predict``.
+
+        :param observation: with the interaction history, if the policy was trained with it
+        :param state: of a recurrent policy; ``None`` at the start of a task, which reads as zeros
+        :param episode_start: changes nothing: states survive the end of an episode, as in training (section 2.4)
+        :param deterministic: take the likeliest action, or the mean, instead of drawing one
+        """
+        actions, state = super().predict(observation, state, None, deterministic)
+        if isinstance(self.action_space, spaces.Discrete):
+            actions = actions + self.action_space.start
+        return actions, state
 
     # ------------------------------------------------------------------------------------------ learn and save
 
@@ -580,13 +614,12 @@ class ReptilePPO(PPO):
         path = pathlib.Path(path)
         path = path if path.suffix else path.with_suffix(".zip")
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=".partial")
-        os.close(handle)
+        temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.partial")
         try:
             super().save(temporary, exclude, include)
             os.replace(temporary, path)
         finally:
-            pathlib.Path(temporary).unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
 
 
 class _Reptile(ReptileWrapper):
@@ -599,6 +632,9 @@ class _Reptile(ReptileWrapper):
         over = 1 - model._current_progress_remaining >= model.search_fraction
         if model.search is not None and model.search.searching and over:
             model.search.select(model.search.most_likely())
+            # The momentum of a meta-optimizer would move W on.
+            assert self.meta_optimizer is not None
+            self.meta_optimizer.state.pop(model.search.logits, None)
         if model.reward_scaler is not None:
             model.reward_scaler.forget_returns()
         super()._begin_task()
@@ -613,6 +649,11 @@ def _make_venv(env: GymEnv | str, n_envs: int | None, seed: int | None, env_kwar
 
 
 def _with_history(venv: VecEnv, interaction_history: bool) -> VecEnv:
+    if interaction_history and any(venv.env_is_wrapped(InteractionHistory)):
+        raise ValueError(
+            "an environment wrapped in InteractionHistory is not accepted; ReptilePPO appends the history itself. "
+            "Give it the environment without the wrapper, or interaction_history=False"
+        )
     if interaction_history and not is_vecenv_wrapped(venv, VecInteractionHistory):
         return VecInteractionHistory(venv)
     return venv

@@ -101,7 +101,8 @@ class TaskDistribution:
         from a ``numpy.random.Generator``), of which all combinations are taken; or a sequence of such mappings from
         parameter to one value. Order them from the easiest for a curriculum.
     :param sampler: ``"uniform"``, ``"curriculum"``, ``"failure"`` or a :class:`Sampler`
-    :param apply: how a variation is put in force: ``"options"`` by ``reset(options=...)``, ``"attributes"`` by setting
+    :param apply: how a variation is put in force: ``"options"`` by ``reset(options=...)``, which the environment must
+        keep in force over the episodes that follow, as all of ``progpolicy_envs`` do; ``"attributes"`` by setting
         attributes of the environment, ``"constructor"`` by making the environment anew (see
         :class:`RemakeOnVariation`)
     :raises ValueError: if there is no variation, or a name is not known
@@ -164,8 +165,16 @@ class TaskDistribution:
         self.success_rates[index] = success if smoothing == 1 else old + smoothing * (success - old)
 
     def label(self, index: int) -> str:
-        """Return a short name of a variation for logs, such as ``n_discs=3``."""
-        parts = (f"{name}={'random' if callable(value) else value}" for name, value in self.variations[index].items())
+        """Return a short name of a variation for logs, such as ``n_discs=3``; what all of them share is left out."""
+        variation = self.variations[index]
+        shared = {
+            name
+            for name, value in variation.items()
+            if all(name in other and other[name] == value for other in self.variations)
+        }
+        if len(self) == 1:
+            shared = set()
+        parts = (f"{k}={'drawn' if callable(v) else v}" for k, v in variation.items() if k not in shared)
         return ",".join(parts) or "default"
 
     def put_in_force(self, env: VecEnv, variations: Sequence[Variation]) -> None:
@@ -173,16 +182,18 @@ class TaskDistribution:
 
         :param env: the training environments
         :param variations: one for each environment
+        :raises ValueError: if the environments cannot be varied in this way
         """
         if self.apply == "options":
             env.set_options([dict(variation) for variation in variations])
             return
         for row, variation in enumerate(variations):
             if self.apply == "constructor":
-                env.env_method("remake", variation, indices=[row])
-            else:
-                for name, value in variation.items():
-                    env.env_method("set_wrapper_attr", name, value, indices=[row])
+                _call(env, row, "remake", variation)
+                continue
+            for name, value in variation.items():
+                if not _call(env, row, "set_wrapper_attr", name, value, force=False):
+                    raise ValueError(f"{name!r} is not accepted; the environment has no attribute of this name")
 
 
 def default_tasks(env_id: str | None) -> TaskDistribution:
@@ -215,8 +226,23 @@ class RemakeOnVariation(gym.Wrapper[Any, Any, Any, Any]):
         self.env = remade
 
 
+def _call(env: VecEnv, row: int, method: str, *args: Any, **kwargs: Any) -> Any:
+    if not env.has_attr(method):
+        raise ValueError(
+            f"these environments are not accepted: they have no {method}(). apply='attributes' needs environments that "
+            "are stepped one by one, not a batched one; apply='constructor' needs each wrapped in RemakeOnVariation; "
+            "apply='options' works with all"
+        )
+    return env.env_method(method, *args, indices=[row], **kwargs)[0]
+
+
 def _enumerate(variations: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> list[Variation]:
     if not isinstance(variations, Mapping):
+        if isinstance(variations, str) or not all(isinstance(variation, Mapping) for variation in variations):
+            raise ValueError(
+                f"variations={variations!r} is not accepted; give a mapping from parameter to values, or a sequence of "
+                "mappings from parameter to one value"
+            )
         return [dict(variation) for variation in variations]
     if not variations:
         return []

@@ -5,12 +5,14 @@ Importing this package registers the ids; ``gym.make("progpolicy_envs:Hanoi-v0")
 
 import gymnasium as gym
 
-from progpolicy_envs.domains import DOMAINS, Domain, get_domain
+from progpolicy_envs.domains import DOMAINS, HIKING_EGOCENTRIC, Domain, get_domain
 
 MAX_EPISODE_STEPS = 500
 
 _ENTRY_POINTS = {
     "Hanoi-v0": ("progpolicy_envs.hanoi:HanoiEnv", "progpolicy_envs.hanoi:HanoiVectorEnv"),
+    "Hiking-v0": ("progpolicy_envs.hiking:HikingEnv", "progpolicy_envs.hiking:HikingVectorEnv"),
+    "Stacking-v0": ("progpolicy_envs.stacking:StackingEnv", "progpolicy_envs.stacking:StackingVectorEnv"),
 }
 
 
@@ -28,4 +30,4 @@ def register_envs() -> None:
 
 register_envs()
 
-__all__ = ["DOMAINS", "Domain", "get_domain", "register_envs"]
+__all__ = ["DOMAINS", "HIKING_EGOCENTRIC", "Domain", "get_domain", "register_envs"]

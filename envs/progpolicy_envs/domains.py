@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from difflib import get_close_matches
+from itertools import product
+from typing import Any
 
 from progpolicy_envs.variation import Variation
 
@@ -16,12 +19,14 @@ class Domain:
     :param size: name of the parameter that makes tasks harder, such as ``n_discs``
     :param train: the variations to train on, the easiest first
     :param unseen: the variations to test generalisation on
+    :param arguments: constructor arguments that hold for all of them
     """
 
     id: str
     size: str
     train: tuple[Variation, ...]
     unseen: tuple[Variation, ...]
+    arguments: Mapping[str, Any] = field(default_factory=dict)
 
 
 DOMAINS: dict[str, Domain] = {
@@ -33,8 +38,34 @@ DOMAINS: dict[str, Domain] = {
             train=tuple({"n_discs": n_discs, "source": "random", "target": "random"} for n_discs in (1, 2, 3, 4)),
             unseen=tuple({"n_discs": n_discs} for n_discs in (5, 6, 7, 8)),
         ),
+        Domain(
+            id="Hiking-v0",
+            size="n_stars",
+            train=tuple({"n_stars": n_stars} for n_stars in (1, 2, 3, 4)),
+            unseen=tuple({"n_stars": n_stars} for n_stars in (5, 6, 7, 8, 9, 10)),
+        ),
+        Domain(
+            id="Stacking-v0",
+            size="n_plates",
+            train=tuple({"n_plates": n_plates} for n_plates in (1, 2, 3, 4)),
+            unseen=tuple({"n_plates": n_plates} for n_plates in (5, 6, 7, 8)),
+        ),
     )
 }
+
+#: Hiking once more, from the hiker's point of view: what is learned on some maps is tested on others.
+HIKING_EGOCENTRIC = Domain(
+    id="Hiking-v0",
+    size="n_stars",
+    train=tuple(
+        {"n_stars": n_stars, "layout": layout} for n_stars, layout in product((1, 2, 3, 4), ("valley", "comb", "fork"))
+    ),
+    unseen=tuple(
+        {"n_stars": n_stars, "layout": layout}
+        for n_stars, layout in product((5, 6, 7, 8, 9, 10), ("spiral", "lakeside", "random"))
+    ),
+    arguments={"observation": "egocentric"},
+)
 
 
 def get_domain(env_id: str) -> Domain:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import cast
+from typing import Any, cast
 
 import torch as th
 from torch import nn
@@ -61,6 +61,12 @@ class Conditions(nn.Module):
         with th.no_grad():
             weight.mul_(mask)
         weight.register_hook(lambda gradient: gradient * mask.to(gradient.device))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a copied or pickled module; torch copies no hooks, so that the block structure is set anew."""
+        super().__setstate__(state)
+        if self.recurrent:
+            self._make_block_diagonal()
 
     def forward(self, inputs: th.Tensor, state: State) -> tuple[th.Tensor, State]:
         """Compute every B for a sequence.
@@ -215,7 +221,10 @@ class ProgramModule(nn.Module):
         :param crisp: run every program as a real if-then-else
         :return: distribution parameters ``(n_steps, n_sequences, n_outputs)`` (see :meth:`mix`) and the new state
         """
-        tests, state = self.conditions(inputs, state)
+        if self.search.needs_conditions:
+            tests, state = self.conditions(inputs, state)
+        else:
+            tests = inputs.new_zeros(*inputs.shape[:-1], self.depth - 1)
         return self.mix(inputs, self.masses(tests, crisp)), state
 
     def initial_state(self, n_sequences: int) -> State:

@@ -23,7 +23,7 @@ Tape = tuple[Array, ...]
 
 
 def scan(kind: Cell, gates: th.Tensor, weight_hh: th.Tensor, bias_hh: th.Tensor, hidden: th.Tensor) -> th.Tensor:
-    """Run a recurrent layer over a sequence; differentiable in all but the initial state.
+    """Run a recurrent layer over a sequence; differentiable in all tensors.
 
     :param kind: ``"rnn"`` or ``"gru"``
     :param gates: ``W_ih x + b_ih``, ``(n_steps, n_sequences, n_gates * hidden_size)``, on the CPU
@@ -58,11 +58,12 @@ class _Scan(th.autograd.Function):
     def backward(ctx: FunctionCtx, d_outputs: th.Tensor) -> tuple[th.Tensor | None, ...]:
         context = cast(Any, ctx)
         d_states = np.ascontiguousarray(d_outputs.numpy().swapaxes(1, 2))
-        d_gates, d_recurrent = _BACKWARD[context.kind](d_states, context.weight.T.copy(), *context.tape)
+        d_gates, d_recurrent, d_hidden = _BACKWARD[context.kind](d_states, context.weight.T.copy(), *context.tape)
         d_weight = np.einsum("tgn,tun->gu", d_recurrent, context.states[:-1], optimize=True)
         d_bias = d_recurrent.sum((0, 2))
         d_inputs = np.ascontiguousarray(d_gates.swapaxes(1, 2))
-        return None, th.from_numpy(d_inputs), th.from_numpy(d_weight), th.from_numpy(d_bias), None
+        gradients = (d_inputs, d_weight, d_bias, np.ascontiguousarray(d_hidden.T))
+        return None, *map(th.from_numpy, gradients)
 
 
 def _rnn_forward(gates: Array, weight: Array, bias: Array, hidden: Array) -> tuple[Array, Tape]:
@@ -75,14 +76,14 @@ def _rnn_forward(gates: Array, weight: Array, bias: Array, hidden: Array) -> tup
     return states, (1 - states[1:] ** 2,)
 
 
-def _rnn_backward(d_states: Array, weight: Array, slope: Array) -> tuple[Array, Array]:
+def _rnn_backward(d_states: Array, weight: Array, slope: Array) -> tuple[Array, Array, Array]:
     d_gates = np.empty_like(slope)
     d_hidden = np.zeros_like(d_states[0])
     for t in reversed(range(len(slope))):
         d_hidden += d_states[t]
         np.multiply(d_hidden, slope[t], out=d_gates[t])
         np.matmul(weight, d_gates[t], out=d_hidden)
-    return d_gates, d_gates
+    return d_gates, d_gates, d_hidden
 
 
 def _gru_forward(gates: Array, weight: Array, bias: Array, hidden: Array) -> tuple[Array, Tape]:
@@ -130,7 +131,7 @@ def _gru_forward(gates: Array, weight: Array, bias: Array, hidden: Array) -> tup
 
 def _gru_backward(
     d_states: Array, weight: Array, states: Array, reset_update: Array, new: Array, inner: Array
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
     units = new.shape[1]
     reset, update = reset_update[:, :units], reset_update[:, units:]
     # Derivatives of each step that do not depend on the steps after it, for all steps at once.
@@ -156,11 +157,11 @@ def _gru_backward(
         d_hidden += through
     d_gates = flat.copy()
     np.multiply(d_hiddens, by_new, out=d_gates[:, 2 * units :])
-    return d_gates, flat
+    return d_gates, flat, d_hidden
 
 
 _FORWARD: dict[Cell, Callable[[Array, Array, Array, Array], tuple[Array, Tape]]] = {
     "rnn": _rnn_forward,
     "gru": _gru_forward,
 }
-_BACKWARD: dict[Cell, Callable[..., tuple[Array, Array]]] = {"rnn": _rnn_backward, "gru": _gru_backward}
+_BACKWARD: dict[Cell, Callable[..., tuple[Array, Array, Array]]] = {"rnn": _rnn_backward, "gru": _gru_backward}

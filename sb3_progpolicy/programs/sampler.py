@@ -15,10 +15,9 @@ from sb3_progpolicy.programs.modules import ProgramModule
 class ProgramSampler:
     """Runs a :class:`ProgramModule` one step at a time for a batch of environments and samples actions.
 
-    It reads the module's parameters in place (they have to be on the CPU) and computes what the module computes
-    under the soft semantics, W included.
+    It computes what the module computes under the soft semantics, W included.
 
-    :param module: the program mixture; W and the temperature are read now, the rest at each step
+    :param module: the program mixture, on the CPU; its parameters are read now: one sampler for each rollout
     :param log_std: logarithm of the standard deviations of Box actions, ``(n_outputs,)``
     """
 
@@ -31,7 +30,8 @@ class ProgramSampler:
         self._scale = 1 / float(module.temperature)
         self._n_controllers = module.n_controllers
         self._std = None if log_std is None else np.exp(_view(log_std))
-        self.recurrent = conditions.recurrent
+        self.needs_conditions = module.search.needs_conditions and self.n_conditions > 0
+        self.recurrent = conditions.recurrent and self.needs_conditions
         # Everything that is affine in X in one product: the gates of the conditions, then the controllers.
         if self.recurrent:
             rnn = conditions.rnn
@@ -39,7 +39,7 @@ class ProgramSampler:
             input_weight, input_bias, weight, self._bias = (_view(getattr(rnn, name)) for name in names)
             self._weight = np.ascontiguousarray(weight.T)
             self._readout, self._readout_bias = _view(conditions.readout), _view(conditions.readout_bias)
-        elif self.n_conditions:
+        elif self.needs_conditions:
             input_weight, input_bias = _view(conditions.affine.weight), _view(conditions.affine.bias)
         else:
             input_weight, input_bias = np.zeros((0, module.n_inputs), np.float32), np.zeros(0, np.float32)
@@ -48,6 +48,7 @@ class ProgramSampler:
         self._affine = np.ascontiguousarray(np.concatenate((input_weight, _view(controllers.weight))).T)
         self._constant = np.concatenate((input_bias, _view(controllers.bias)))
         self._edges = np.cumsum(self.action.sizes)[:-1]
+        self._mass_sum, self._n_samples = np.zeros(self._n_controllers), 0
 
     def tests(self, gates: Array, hidden: Array, cell: Array) -> tuple[Array, Array, Array]:
         """Return the values of B ``(n_envs, n_conditions)`` and the new states.
@@ -56,6 +57,8 @@ class ProgramSampler:
         :param hidden: ``(n_envs, hidden_size)``
         :param cell: ``(n_envs, hidden_size)``, used by LSTM conditions
         """
+        if not self.needs_conditions:
+            return np.zeros((len(gates), self.n_conditions), dtype=np.float32), hidden, cell
         if not self.recurrent:
             return gates, hidden, cell
         hidden, cell = STEPS[self.cell](gates, hidden @ self._weight + self._bias, hidden, cell)
@@ -72,6 +75,10 @@ class ProgramSampler:
         np.cumprod(1 - taken, axis=1, out=reached[:, 1:])
         return np.concatenate((taken * reached[:, :-1] * self._at_least, reached * self._probabilities), axis=1)
 
+    def branch_frequencies(self) -> Array:
+        """Return the share of the samples drawn so far that each controller decided, ``(2 depth - 1,)``."""
+        return self._mass_sum / max(1, self._n_samples)
+
     def sample(
         self, inputs: Array, hidden: Array, cell: Array, rng: np.random.Generator
     ) -> tuple[NDArray[Any], Array, Array]:
@@ -86,6 +93,8 @@ class ProgramSampler:
         affine = inputs @ self._affine + self._constant
         tests, hidden, cell = self.tests(affine[:, : self._n_gates], hidden, cell)
         masses = self.masses(tests)
+        self._mass_sum += masses.sum(0)
+        self._n_samples += len(masses)
         outputs = affine[:, self._n_gates :].reshape(len(inputs), self._n_controllers, -1)
         if self.action.kind == "box":
             mean = (masses[:, :, None] * outputs).sum(1)

@@ -30,6 +30,11 @@ class DerivationSearch(nn.Module):
         """Whether no program has been selected yet."""
         return bool(self.selected == SEARCHING)
 
+    @property
+    def needs_conditions(self) -> bool:
+        """Whether any condition can matter: not once a program without conditions has been selected."""
+        return bool(self.selected != 0)
+
     def select(self, n_conditions: int) -> None:
         """End the search: from now on only the program with ``n_conditions`` conditions is run.
 

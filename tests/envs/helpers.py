@@ -2,11 +2,14 @@
 
 import gc
 import os
+import subprocess
+import sys
 import warnings
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
@@ -51,6 +54,17 @@ def assert_long_run_stays_sound(env_id: str, n_actions: int, options: list[dict[
     assert resident_bytes() - after_warm_up < 8 * 2**20
 
 
+def assert_resets_hold_no_memory(env_id: str, **arguments: Any) -> None:
+    """Reset the single form a thousand times, with an action in between."""
+    env = gym.make(env_id, **arguments)
+    for reset in range(1200):
+        if reset == 200:
+            after_warm_up = resident_bytes()
+        env.reset(seed=reset)
+        env.step(env.action_space.sample())
+    assert resident_bytes() - after_warm_up < 4 * 2**20
+
+
 def assert_picture_shows_the_state(env: gym.Env[Any, Any], action: int) -> None:
     """Check the form of a picture, that it changes with the state, and that reading it does not change the state."""
     env.reset(seed=0)
@@ -61,3 +75,20 @@ def assert_picture_shows_the_state(env: gym.Env[Any, Any], action: int) -> None:
     np.testing.assert_array_equal(before, env.render())
     env.step(action)
     assert (before != env.render()).any()
+
+
+def run_python(code: str, **environment: str) -> None:
+    """Run code in a process of its own; fail if it does."""
+    variables = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **environment}
+    subprocess.run([sys.executable, "-c", code], check=True, env=variables, timeout=60)
+
+
+def assert_window_opens_shows_and_closes(env_id: str) -> None:
+    """Run ``render_mode="human"`` without a screen."""
+    pytest.importorskip("pygame")
+    run_python(
+        "import gymnasium as gym, progpolicy_envs, pygame\n"
+        f"env = gym.make({env_id!r}, render_mode='human'); env.reset(seed=0); env.step(0)\n"
+        "assert pygame.display.get_init(); env.close(); assert not pygame.display.get_init()\n",
+        SDL_VIDEODRIVER="dummy",
+    )

@@ -3,10 +3,12 @@
 import gymnasium as gym
 import pytest
 
-from progpolicy_envs import DOMAINS, MAX_EPISODE_STEPS, get_domain
+from progpolicy_envs import DOMAINS, HIKING_EGOCENTRIC, MAX_EPISODE_STEPS, Domain, get_domain
 
 SIZES = {
     "Hanoi-v0": ({1, 2, 3, 4}, {5, 6, 7, 8}),
+    "Hiking-v0": ({1, 2, 3, 4}, {5, 6, 7, 8, 9, 10}),
+    "Stacking-v0": ({1, 2, 3, 4}, {5, 6, 7, 8}),
 }
 
 
@@ -18,16 +20,21 @@ def test_training_and_unseen_sizes_are_those_of_the_specification(env_id: str) -
     assert next(iter(domain.train))[domain.size] == min(train), "the easiest comes first"
 
 
-@pytest.mark.parametrize("env_id", SIZES)
-def test_every_variation_is_accepted_and_has_a_plan_within_the_cap(env_id: str) -> None:
-    domain = DOMAINS[env_id]
-    env = gym.make(env_id)
+@pytest.mark.parametrize("domain", [*(DOMAINS[env_id] for env_id in SIZES), HIKING_EGOCENTRIC], ids=lambda d: d.id)
+def test_every_variation_is_accepted_and_has_a_plan_within_the_cap(domain: Domain) -> None:
+    env = gym.make(domain.id, **domain.arguments)
     assert env.spec is not None
     assert env.spec.max_episode_steps == MAX_EPISODE_STEPS == 500
     for variation in (*domain.train, *domain.unseen):
         _, info = env.reset(seed=0, options=variation)
         assert info["variation"].items() >= variation.items()
         assert 1 <= info["optimal_steps"] <= MAX_EPISODE_STEPS
+
+
+def test_egocentric_hiking_is_tested_on_maps_and_numbers_of_stars_not_trained_on() -> None:
+    for name in ("n_stars", "layout"):
+        train, unseen = ({v[name] for v in part} for part in (HIKING_EGOCENTRIC.train, HIKING_EGOCENTRIC.unseen))
+        assert not train & unseen
 
 
 def test_domain_is_found_with_and_without_module_prefix() -> None:

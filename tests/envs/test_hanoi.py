@@ -1,8 +1,5 @@
 """Hanoi-v0, held against the puzzle's rules rather than against its own code."""
 
-import os
-import subprocess
-import sys
 from collections import deque
 from itertools import pairwise, permutations, product
 from pathlib import Path
@@ -16,8 +13,15 @@ from hypothesis import strategies as st
 import progpolicy_envs
 from progpolicy_envs.hanoi import ACTION_NAMES, MOVES, OBSERVATION_NAMES, HanoiEnv
 from progpolicy_envs.planners import hanoi as planner
-from tests.envs.helpers import assert_checkers_are_silent, assert_long_run_stays_sound, assert_picture_shows_the_state
-from tests.handwritten.evaluate import CrispPolicy, play, size_of
+from tests.envs.helpers import (
+    assert_checkers_are_silent,
+    assert_long_run_stays_sound,
+    assert_picture_shows_the_state,
+    assert_resets_hold_no_memory,
+    assert_window_opens_shows_and_closes,
+    run_python,
+)
+from tests.handwritten.evaluate import Player, play, play_batch, size_of
 from tests.handwritten.hanoi import hanoi_program
 
 
@@ -120,21 +124,41 @@ def test_observation_is_what_the_docstring_says() -> None:
 def test_handwritten_controller_is_optimal_on_training_and_unseen_variations(n_discs: int) -> None:
     program = hanoi_program()
     assert size_of(program) == (0, 1)
-    env = gym.make("Hanoi-v0", max_episode_steps=2**10)
-    for source, target in permutations(range(3), 2):
-        episode = play(program, env, n_discs=n_discs, source=source, target=target)
-        assert episode.success
-        assert episode.steps == episode.optimal == 2**n_discs - 1
+    episodes = play_batch(program, "Hanoi-v0", 24, 2**10, n_discs=n_discs, source="random", target="random")
+    assert all(episode.success for episode in episodes)
+    assert {episode.steps for episode in episodes} == {episode.optimal for episode in episodes} == {2**n_discs - 1}
 
 
 def test_handwritten_controller_stays_optimal_when_its_history_survives_episodes() -> None:
-    policy = CrispPolicy(hanoi_program())
+    policy = Player(hanoi_program())
     env = gym.make("Hanoi-v0", n_discs=4)
     assert [play(policy, env).steps for _ in range(4)] == [15] * 4
 
 
+@pytest.mark.parametrize(
+    ("source", "target", "pairs"),
+    [
+        ("random", "random", set(permutations(range(3), 2))),
+        (1, "random", {(1, 0), (1, 2)}),
+        ("random", 0, {(1, 0), (2, 0)}),
+    ],
+)
+def test_random_pegs_are_drawn_anew_for_each_episode(
+    source: int | str, target: int | str, pairs: set[tuple[int, int]]
+) -> None:
+    env = HanoiEnv(n_discs=2, source=source, target=target)
+    drawn = set()
+    for episode in range(60):
+        _, info = env.reset(seed=3 if episode == 0 else None)
+        assert info["variation"] == {"n_discs": 2, "source": source, "target": target}
+        drawn.add((env.source, env.target))
+        moves = list(planner.plan(env.discs, env.target))
+        assert [env.step(MOVES.index(move))[2] for move in moves] == [False, False, True]
+    assert drawn == pairs
+
+
 def test_source_and_target_must_differ() -> None:
-    with pytest.raises(ValueError, match=r"source=1 and target=1 .* two different pegs from 0 to 2"):
+    with pytest.raises(ValueError, match=r"source=1 and target=1 .* two different pegs from 0 to 2, or 'random'"):
         HanoiEnv(source=1, target=1)
     env = HanoiEnv(source=0, target=2)
     with pytest.raises(ValueError, match="source=2 and target=2"):
@@ -164,15 +188,12 @@ def test_picture_shows_the_state() -> None:
     assert_picture_shows_the_state(gym.make("Hanoi-v0", render_mode="rgb_array"), action=0)
 
 
-def test_window_opens_shows_and_closes(tmp_path: Path) -> None:
-    code = (
-        "import gymnasium as gym, progpolicy_envs, pygame\n"
-        "env = gym.make('Hanoi-v0', render_mode='human'); env.reset(); env.step(0)\n"
-        "assert pygame.display.get_init(); env.close(); assert not pygame.display.get_init()\n"
-    )
-    pytest.importorskip("pygame")
-    environment = {**os.environ, "SDL_VIDEODRIVER": "dummy", "PYTHONPATH": os.pathsep.join(sys.path)}
-    subprocess.run([sys.executable, "-c", code], check=True, env=environment, timeout=60)
+def test_a_thousand_resets_hold_no_memory() -> None:
+    assert_resets_hold_no_memory("Hanoi-v0", n_discs=12)
+
+
+def test_window_opens_shows_and_closes() -> None:
+    assert_window_opens_shows_and_closes("Hanoi-v0")
 
 
 @pytest.mark.parametrize("n_discs", [1, 12])
@@ -187,8 +208,7 @@ def test_long_run_of_random_actions() -> None:
 
 def test_registration_does_not_import_the_environment() -> None:
     code = "import progpolicy_envs, sys; assert not {'progpolicy_envs.hanoi', 'pybullet', 'torch'} & set(sys.modules)"
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    subprocess.run([sys.executable, "-c", code], check=True, env=environment, timeout=60)
+    run_python(code)
     assert "Hanoi-v0" in progpolicy_envs.DOMAINS
 
 

@@ -8,17 +8,37 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
+from progpolicy_envs.hanoi import MOVES, HanoiEnv
+from progpolicy_envs.hiking import HikingEnv
+from progpolicy_envs.layouts import LAYOUTS
+from progpolicy_envs.planners import hanoi, hiking, stacking
+
 Draw = Callable[[np.random.Generator, int], dict[str, Any]]
 
 
 def draw_hanoi(generator: np.random.Generator, num_envs: int) -> dict[str, Any]:
     pegs = generator.permuted(np.tile(np.arange(3), (num_envs, 1)), axis=1)
-    return {"n_discs": generator.integers(1, 13, num_envs), "source": pegs[:, 0], "target": pegs[:, 1]}
+    source, target = ([*pegs[:-9, column].tolist(), *["random"] * 9] for column in (0, 1))
+    return {"n_discs": generator.integers(1, 13, num_envs), "source": source, "target": target}
+
+
+def draw_hiking(generator: np.random.Generator, num_envs: int) -> dict[str, Any]:
+    layouts = [*LAYOUTS, "random"]
+    # Up to 7 stars only: the planner's table doubles with each, and its own tests go to 12.
+    return {"n_stars": generator.integers(1, 8, num_envs), "layout": list(generator.choice(layouts, num_envs))}
+
+
+def draw_stacking(generator: np.random.Generator, num_envs: int) -> dict[str, Any]:
+    return {"n_plates": generator.integers(1, 9, num_envs)}
 
 
 CASES: list[tuple[str, dict[str, Any], Draw]] = [
     ("Hanoi-v0", {}, draw_hanoi),
+    ("Hiking-v0", {"observation": "map"}, draw_hiking),
+    ("Hiking-v0", {"observation": "egocentric"}, draw_hiking),
+    ("Stacking-v0", {}, draw_stacking),
 ]
+IDS = [f"{env_id}-{arguments.get('observation', 'default')}" for env_id, arguments, _ in CASES]
 NUM_ENVS, LIMIT, STEPS = 64, 37, 90
 
 
@@ -27,11 +47,13 @@ def make_vec(env_id: str, num_envs: int = NUM_ENVS, **arguments: Any) -> gym.vec
 
 
 @pytest.mark.parametrize("seed", [0, 1, 12345])
-@pytest.mark.parametrize(("env_id", "arguments", "draw"), CASES, ids=lambda case: str(case)[:60])
+@pytest.mark.parametrize(("env_id", "arguments", "draw"), CASES, ids=IDS)
 def test_batched_equals_single_step_for_step(env_id: str, arguments: dict[str, Any], draw: Draw, seed: int) -> None:
     generator = np.random.default_rng(seed)
     batched = make_vec(env_id, max_episode_steps=LIMIT, **arguments)
-    singles = [gym.make(env_id, max_episode_steps=LIMIT, **arguments) for _ in range(NUM_ENVS)]
+    singles = [
+        gym.make(env_id, max_episode_steps=LIMIT, disable_env_checker=True, **arguments) for _ in range(NUM_ENVS)
+    ]
     for change in range(4):
         options = draw(generator, NUM_ENVS) if change else {}
         row_options = [{name: values[row] for name, values in options.items()} for row in range(NUM_ENVS)]
@@ -44,13 +66,42 @@ def test_batched_equals_single_step_for_step(env_id: str, arguments: dict[str, A
             assert infos["optimal_steps"][row] == info["optimal_steps"]
             assert infos["is_success"][row] == info["is_success"]
         for _ in range(STEPS):
-            compare_one_step(batched, singles, generator)
+            actions = generator.integers(batched.single_action_space.n, size=NUM_ENVS)
+            compare_one_step(batched, singles, actions)
+
+
+def next_planned(env: Any) -> int:
+    """Return the planner's next action in a single environment."""
+    if isinstance(env, HanoiEnv):
+        return MOVES.index(next(iter(hanoi.plan(env.discs, env.target))))
+    if isinstance(env, HikingEnv):
+        return hiking.plan(env.layout, env.hiker, sorted(env.stars))[0]
+    return stacking.plan(env.gripper, env.plates)[0]
+
+
+@pytest.mark.parametrize(("env_id", "arguments", "draw"), CASES, ids=IDS)
+def test_batched_equals_single_where_episodes_succeed(env_id: str, arguments: dict[str, Any], draw: Draw) -> None:
+    generator = np.random.default_rng(2)
+    batched, singles = (
+        make_vec(env_id, **arguments),
+        [gym.make(env_id, disable_env_checker=True, **arguments) for _ in range(NUM_ENVS)],
+    )
+    batched.reset(seed=0)
+    for row, env in enumerate(singles):
+        env.reset(seed=row)
+    n_successes = 0
+    for _ in range(150):
+        planned = np.array([next_planned(env.unwrapped) for env in singles])
+        random = generator.integers(batched.single_action_space.n, size=NUM_ENVS)
+        actions = np.where(generator.random(NUM_ENVS) < 0.8, planned, random)
+        n_successes += compare_one_step(batched, singles, actions)
+    assert n_successes > NUM_ENVS
 
 
 def compare_one_step(
-    batched: gym.vector.VectorEnv, singles: list[gym.Env[Any, Any]], generator: np.random.Generator
-) -> None:
-    actions = generator.integers(batched.single_action_space.n, size=NUM_ENVS)
+    batched: gym.vector.VectorEnv, singles: list[gym.Env[Any, Any]], actions: np.ndarray[Any, Any]
+) -> int:
+    """Step both forms, starting new episodes where they end, and return how many reached the goal."""
     observations, rewards, terminated, truncated, infos = batched.step(actions)
     for row, env in enumerate(singles):
         observation, reward, single_terminated, single_truncated, info = env.step(actions[row])
@@ -61,9 +112,10 @@ def compare_one_step(
             np.testing.assert_array_equal(infos["final_obs"][row], observation)
             observation, _ = env.reset()
         np.testing.assert_array_equal(observations[row], observation)
+    return int(terminated.sum())
 
 
-@pytest.mark.parametrize(("env_id", "arguments", "draw"), CASES, ids=lambda case: str(case)[:60])
+@pytest.mark.parametrize(("env_id", "arguments", "draw"), CASES, ids=IDS)
 class TestEveryBatchedForm:
     def test_spaces_are_those_of_the_single_form(self, env_id: str, arguments: dict[str, Any], draw: Draw) -> None:
         batched, single = make_vec(env_id, 3, **arguments), gym.make(env_id, **arguments)

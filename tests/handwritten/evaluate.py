@@ -1,4 +1,4 @@
-"""Run a program crisply on an environment: the few lines of NumPy that the grammar's semantics amounts to."""
+"""Run programs crisply on environments, with the history of section 2.4, and count their steps."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -7,36 +7,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_progpolicy.programs.syntax import Controller, IfThenElse, Program
-
-
-class CrispPolicy:
-    """A discrete program whose conditions are all affine, run as a real if-then-else with interaction history.
-
-    :param program: the program; it has no recurrent conditions
-    """
-
-    def __init__(self, program: Program) -> None:
-        if any(condition.cell != "affine" for condition in program.conditions):
-            raise ValueError("only affine conditions are run here")
-        self.program = program
-        self._conditions = [(np.array(c.readout), c.readout_bias) for c in program.conditions]
-        self._controllers = [(np.array(c.weights), np.array(c.bias)) for c in program.controllers]
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the history, as at a task switch."""
-        self.reward, self.done = 0.0, False
-        self._previous = np.zeros(self.program.action.history_size)
-
-    def act(self, observation: NDArray[np.float32]) -> int:
-        """Return the action of the branch whose condition holds first."""
-        x = np.concatenate([observation, self._previous, [self.reward, float(self.done)]])
-        branch = next((k for k, (weights, bias) in enumerate(self._conditions) if weights @ x + bias >= 0), -1)
-        weights, bias = self._controllers[branch]
-        action = int(np.argmax(weights @ x + bias))
-        self._previous = np.eye(self.program.action.n_outputs)[action]
-        return action
+from sb3_progpolicy.programs import Controller, IfThenElse, Program, ProgramRunner, join_inputs
 
 
 @dataclass(frozen=True)
@@ -48,19 +19,67 @@ class Episode:
     optimal: int
 
 
-def play(program: Program | CrispPolicy, env: gym.Env[Any, Any], seed: int | None = None, **options: Any) -> Episode:
-    """Run one episode: a program from a fresh history, a policy with the history it has.
+class Player:
+    """A program with its memory and the history that it reads, for environments stepped together.
+
+    :param program: the program
+    :param n_envs: number of environments
+    """
+
+    def __init__(self, program: Program, n_envs: int = 1) -> None:
+        self.runner = ProgramRunner(program, n_envs)
+        self.previous: tuple[Any, Any, Any] = (None, 0.0, False)
+
+    def act(self, observations: NDArray[np.float32]) -> NDArray[Any]:
+        """Return one action for each environment."""
+        return self.runner.act(join_inputs(self.runner.program, observations, *self.previous))
+
+    def remember(self, actions: NDArray[Any], rewards: Any, dones: Any) -> None:
+        """Keep what was done and what came of it for the next input."""
+        self.previous = (actions, rewards, dones)
+
+
+def play(program: Program | Player, env: gym.Env[Any, Any], seed: int | None = None, **options: Any) -> Episode:
+    """Run one episode: a program from a fresh history, a player with the history it has.
 
     :param options: variation, as for ``reset(options=...)``
     """
-    policy = program if isinstance(program, CrispPolicy) else CrispPolicy(program)
+    player = program if isinstance(program, Player) else Player(program)
     observation, info = env.reset(seed=seed, options=options)
     optimal, ended, steps = info["optimal_steps"], False, 0
     while not ended:
-        observation, reward, terminated, truncated, info = env.step(policy.act(observation))
+        actions = player.act(observation)
+        observation, reward, terminated, truncated, info = env.step(actions[0])
         ended, steps = terminated or truncated, steps + 1
-        policy.reward, policy.done = float(reward), ended
+        player.remember(actions, float(reward), ended)
     return Episode(info["is_success"], steps, optimal)
+
+
+def play_batch(
+    program: Program, env_id: str, n_episodes: int, max_episode_steps: int = 500, **arguments: Any
+) -> list[Episode]:
+    """Run one episode with each of the seeds 0, 1, 2 ... in the batched form, each from a fresh history."""
+    env = gym.make_vec(
+        env_id,
+        num_envs=n_episodes,
+        vectorization_mode="vector_entry_point",
+        max_episode_steps=max_episode_steps,
+        **arguments,
+    )
+    observations, infos = env.reset(seed=0)
+    player, steps, success = Player(program, n_episodes), np.zeros(n_episodes, int), np.zeros(n_episodes, bool)
+    for step in range(1, max_episode_steps + 1):
+        actions = player.act(observations)
+        observations, rewards, terminated, truncated, _ = env.step(actions)
+        player.remember(actions, rewards, terminated | truncated)
+        first_end = (terminated | truncated) & (steps == 0)
+        steps[first_end], success[first_end] = step, terminated[first_end]
+        if steps.all():
+            break
+    return [
+        Episode(bool(s), int(n), int(optimal))
+        for s, n, optimal in zip(success, steps, infos["optimal_steps"], strict=True)
+    ]
 
 
 def size_of(program: Program) -> tuple[int, int]:

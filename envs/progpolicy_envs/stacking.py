@@ -1,0 +1,280 @@
+"""Stacking-v0: pick plates up from a table, the largest first."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from progpolicy_envs.layouts import DIRECTIONS
+from progpolicy_envs.planners import stacking as planner
+from progpolicy_envs.rendering import Display, stacking_frame
+from progpolicy_envs.variation import IntParameter, Variation, VariationSpace
+from progpolicy_envs.vector import PlanningVectorEnv
+
+MAX_PLATES = 8
+N_SIDE = 5
+N_CELLS = N_SIDE**2
+PICK = planner.PICK
+VARIATIONS = VariationSpace(IntParameter("n_plates", 1, MAX_PLATES, "number of plates"))
+STEP_REWARD, ILLEGAL_REWARD, PLATE_REWARD = -0.01, -0.05, 1.0
+#: How many times a plate's number on the table is that of the next smaller one. A power of 2, so that all are exact.
+DOMINANCE = 8.0
+
+ACTION_NAMES = (*DIRECTIONS, "pick")
+OBSERVATION_NAMES = (
+    *(f"table[{row},{column}]" for row in range(N_SIDE) for column in range(N_SIDE)),
+    *(f"stack[{slot}]" for slot in range(MAX_PLATES)),
+    "gripper[row]",
+    "gripper[column]",
+)
+_STACK, _GRIPPER = N_CELLS, N_CELLS + MAX_PLATES  # where the stack and the gripper begin in the observation
+_OBSERVATION_SPACE = spaces.Box(
+    np.array([0] * _GRIPPER + [-1] * 2, np.float32), np.ones(len(OBSERVATION_NAMES), np.float32), dtype=np.float32
+)
+
+
+def draw_task(generator: np.random.Generator, variation: Variation) -> tuple[NDArray[np.int64], int]:
+    """Draw the cells of the plates, the largest first, and the cell of the gripper.
+
+    :param generator: the environment's generator
+    :param variation: the value of ``n_plates``
+    """
+    return generator.permutation(N_CELLS)[: variation["n_plates"]], int(generator.integers(N_CELLS))
+
+
+class StackingEnv(gym.Env[NDArray[np.float32], np.int64]):
+    """Move a gripper over a table and pick plates up one by one, the largest first, onto one stack.
+
+    ## Description
+    ``n_plates`` plates of different sizes lie on different cells of a 5 x 5 table. The gripper hovers over one cell.
+    It can pick up the largest plate on the table only, when it is right above it; the plate then lies on top of the
+    stack. The task is done when the last plate is on the stack.
+
+    ## Action Space
+    ``Discrete(5)``: 0 north, 1 east, 2 south, 3 west, 4 pick.
+
+    ## Observation Space
+    ``Box(35,)``, the same for any number of plates.
+
+    | Num     | Observation       | Min | Max | Meaning                                                              |
+    |---------|-------------------|-----|-----|----------------------------------------------------------------------|
+    | 0 - 24  | table[row,column] | 0   | 1   | the plate on the cell, by its place among the plates still on the    |
+    |         |                   |     |     | table: 1 the largest, 1/8 the next, 1/64 the third ...; 0 for none   |
+    | 25 - 32 | stack[slot]       | 0   | 1   | the plate in the slot, from the bottom upwards: its size divided by  |
+    |         |                   |     |     | that of the largest (sizes are 1 to n_plates); 0 for none            |
+    | 33      | gripper[row]      | -1  | 1   | -1 the northernmost row, 0 the middle, 1 the southernmost            |
+    | 34      | gripper[column]   | -1  | 1   | -1 the westernmost column, 0 the middle, 1 the easternmost           |
+
+    ### What a short program can do with it
+    Let column(c) be -2 to 2. The sum over all cells of ``table[c] * column(c)`` is the column of the largest plate,
+    give or take at most ``2 * (1/8 + 1/64 + ...) < 2/7``, since each plate outweighs all smaller ones together. Columns
+    are whole numbers, so ``sum - 2 * gripper[column] >= 1/2`` says exactly "the largest plate lies further east", for
+    any number of plates. Four such affine conditions (east, west, south, north) and five constant controllers, the
+    last of which picks, are an optimal program. With plates numbered by absolute size the weight of the largest would
+    shrink from pick to pick, and one affine condition could not compare it with the gripper's place; that is why the
+    numbers are relative to the plates still on the table, as the ranks of Hanoi are to the tops.
+
+    The observation says where things are and which plate is larger than which. In which direction to go is not in it.
+
+    ## Rewards
+    -0.01 a step, a further -0.05 for an illegal action (a move off the table, or a pick where the largest plate of
+    the table is not; nothing changes then), +1 for each plate picked up.
+
+    ## Starting State
+    Plates and gripper on cells drawn with the environment's generator; the gripper may start above a plate.
+
+    ## Episode End
+    Terminated when all plates are on the stack; truncated after 500 steps (``max_episode_steps``).
+
+    ## Information
+    ``info["is_success"]`` at every step; at reset also ``info["variation"]`` and ``info["optimal_steps"]``.
+
+    ## Arguments
+    ``gym.make("Stacking-v0", n_plates=5)`` or ``env.reset(options={"n_plates": 5})``; an option stays in force until
+    it is changed. Values that are not accepted raise ``ValueError``.
+
+    | Parameter | Values | Default | Meaning          |
+    |-----------|--------|---------|------------------|
+    | n_plates  | 1 to 8 | 3       | number of plates |
+
+    ## References
+    Compare the domain `blocks` of PDDLGym (Silver and Chitnis, 2020).
+
+    ## Version History
+    * v0: initial version
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array", "ansi"], "render_fps": 6}
+    variations: ClassVar[VariationSpace] = VARIATIONS
+    observation_names: ClassVar[tuple[str, ...]] = OBSERVATION_NAMES
+    action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
+
+    def __init__(self, n_plates: int = 3, render_mode: str | None = None) -> None:
+        self.variation = self.variations.update({}, {"n_plates": n_plates})
+        self.observation_space = _OBSERVATION_SPACE
+        self.action_space = spaces.Discrete(len(ACTION_NAMES))
+        self.render_mode = render_mode
+        self.plates: list[tuple[int, int]] = []
+        self.gripper = (0, 0)
+        self._display = Display(self.metadata["render_fps"])
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Lay the plates onto the table and place the gripper.
+
+        :param seed: seeds the generator that draws the positions
+        :param options: new values of variation parameters; they stay in force
+        :return: observation ``(35,)`` and info
+        :raises ValueError: if a variation is not accepted; the variation in force is then unchanged
+        """
+        super().reset(seed=seed)
+        self.variation = self.variations.update(self.variation, options)
+        cells, gripper = draw_task(self.np_random, self.variation)
+        self.plates = [divmod(cell, N_SIDE) for cell in cells.tolist()]
+        self.gripper = divmod(gripper, N_SIDE)
+        info = {
+            "is_success": False,
+            "variation": dict(self.variation),
+            "optimal_steps": planner.optimal_steps(self.gripper, self.plates),
+        }
+        self._show()
+        return self._observe(), info
+
+    def step(self, action: np.int64 | int) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Move the gripper or pick a plate up, if that is possible.
+
+        :param action: 0 to 4, see the class
+        :return: observation, reward, terminated, truncated, info
+        :raises ValueError: if the action is out of range
+        """
+        if not self.action_space.contains(action):
+            raise ValueError(f"action={action!r} is not accepted; actions are integers from 0 to {PICK}")
+        reward = STEP_REWARD
+        if action == PICK:
+            if self.gripper == next(iter(self.plates), None):
+                del self.plates[0]
+                reward += PLATE_REWARD
+            else:
+                reward += ILLEGAL_REWARD
+        else:
+            down, right = DIRECTIONS[ACTION_NAMES[int(action)]]
+            row, column = self.gripper[0] + down, self.gripper[1] + right
+            if 0 <= row < N_SIDE and 0 <= column < N_SIDE:
+                self.gripper = (row, column)
+            else:
+                reward += ILLEGAL_REWARD
+        solved = not self.plates
+        self._show()
+        return self._observe(), reward, solved, False, {"is_success": solved}
+
+    def render(self) -> Any:
+        """Return a picture ``(height, width, 3)`` of bytes, or a text, or show a window, as ``render_mode`` says."""
+        if self.render_mode == "ansi":
+            return self._text()
+        if self.render_mode == "rgb_array":
+            return self._frame()
+        self._show()
+        return None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self._display.close()
+
+    def _observe(self) -> NDArray[np.float32]:
+        n_plates = self.variation["n_plates"]
+        observation = np.zeros(len(OBSERVATION_NAMES), dtype=np.float32)
+        for rank, (row, column) in enumerate(self.plates):
+            observation[row * N_SIDE + column] = DOMINANCE**-rank
+        for slot in range(n_plates - len(self.plates)):
+            observation[_STACK + slot] = (n_plates - slot) / n_plates
+        observation[_GRIPPER:] = [2 * place / (N_SIDE - 1) - 1 for place in self.gripper]
+        return observation
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self._display.show(self._frame())
+
+    def _frame(self) -> NDArray[np.uint8]:
+        return stacking_frame(N_SIDE, self.plates, self.variation["n_plates"], self.gripper)
+
+    def _text(self) -> str:
+        sizes = {plate: len(self.plates) - rank for rank, plate in enumerate(self.plates)}
+        rows = []
+        for row in range(N_SIDE):
+            cells = [str(sizes.get((row, column), ".")) for column in range(N_SIDE)]
+            marked = [f"[{cell}]" if (row, c) == self.gripper else f" {cell} " for c, cell in enumerate(cells)]
+            rows.append("".join(marked).rstrip())
+        stack = " ".join(str(size) for size in range(self.variation["n_plates"], len(self.plates), -1))
+        return "\n".join([*rows, f"stack: {stack}".strip()]) + "\n"
+
+
+class StackingVectorEnv(PlanningVectorEnv):
+    """N tables stepped at once, equal to N :class:`StackingEnv` step for step.
+
+    The observations are the state and are kept up to date: a pick multiplies what is left on the table.
+
+    :param num_envs: number of environments
+    :param n_plates: see :class:`StackingEnv`
+    :param max_episode_steps: steps after which an episode is truncated; ``None`` for no limit
+    """
+
+    variations: ClassVar[VariationSpace] = VARIATIONS
+    observation_names: ClassVar[tuple[str, ...]] = OBSERVATION_NAMES
+    action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
+
+    _MOVES = np.array([*DIRECTIONS.values(), (0, 0)])
+
+    def __init__(self, num_envs: int = 1, n_plates: int = 3, max_episode_steps: int | None = None) -> None:
+        variation = self.variations.update({}, {"n_plates": n_plates})
+        super().__init__(num_envs, _OBSERVATION_SPACE, spaces.Discrete(len(ACTION_NAMES)), variation, max_episode_steps)
+        self._state = np.zeros((num_envs, len(OBSERVATION_NAMES)), dtype=np.float32)
+        self._grippers = np.zeros((num_envs, 2), dtype=np.int64)
+        self._n_plates = np.full(num_envs, n_plates)
+        self._n_picked = np.zeros(num_envs, dtype=np.int64)
+        self._plates: list[NDArray[np.int64]] = [np.zeros(0, dtype=np.int64)] * num_envs
+
+    def _reset_rows(self, rows: NDArray[np.intp]) -> None:
+        self._state[rows] = 0
+        for row in rows:
+            plates, gripper = draw_task(self._generators[row], self.row_variations[row])
+            self._state[row, plates] = DOMINANCE ** -np.arange(len(plates))
+            self._grippers[row] = divmod(gripper, N_SIDE)
+            self._plates[row], self._n_plates[row] = plates, len(plates)
+        self._n_picked[rows] = 0
+        self._show_grippers()
+
+    def _apply(self, actions: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        moved = self._grippers + self._MOVES[actions]
+        self._grippers = np.clip(moved, 0, N_SIDE - 1)
+        self._show_grippers()
+        above = self._grippers[:, 0] * N_SIDE + self._grippers[:, 1]
+        picking = actions == PICK
+        picked = picking & (self._state[self._rows, above] == 1)
+        illegal = np.where(picking, ~picked, (self._grippers != moved).any(axis=1))
+        rows = np.flatnonzero(picked)
+        self._state[rows, above[rows]] = 0
+        self._state[rows, :_STACK] *= DOMINANCE
+        slots, n_plates = self._n_picked[rows], self._n_plates[rows]
+        self._state[rows, _STACK + slots] = (n_plates - slots) / n_plates
+        self._n_picked[rows] += 1
+        rewards = np.where(illegal, STEP_REWARD + ILLEGAL_REWARD, STEP_REWARD) + PLATE_REWARD * picked
+        return rewards, self._n_picked == self._n_plates
+
+    def _show_grippers(self) -> None:
+        self._state[:, _GRIPPER:] = 2 * self._grippers / (N_SIDE - 1) - 1
+
+    def _observe(self) -> NDArray[np.float32]:
+        return self._state.copy()
+
+    def _optimal_steps(self) -> NDArray[np.int64]:
+        return np.array(
+            [
+                planner.optimal_steps((row, column), [divmod(cell, N_SIDE) for cell in plates.tolist()])
+                for (row, column), plates in zip(self._grippers.tolist(), self._plates, strict=True)
+            ]
+        )

@@ -1,0 +1,171 @@
+"""``progpolicy render``: an episode as an animated GIF."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from sb3_progpolicy.cli.parsing import Source, default_variations, find_source, parse_variations
+from sb3_progpolicy.cli.streams import quiet_stdout
+from sb3_progpolicy.nearest import unknown
+from sb3_progpolicy.programs.files import write_atomically
+
+LAST_FRAME_SECONDS = 2.0
+
+
+def render(
+    run_or_name: Annotated[
+        str,
+        typer.Argument(help="run folder, program, model or pretrained name; with --planner or --random also an id"),
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="file to write, .gif")],
+    variation: Annotated[list[str] | None, typer.Option("--set", help="the variation: n_discs=7")] = None,
+    planner: Annotated[bool, typer.Option("--planner", help="the domain's planner acts")] = False,
+    random: Annotated[bool, typer.Option("--random", help="actions are drawn at random")] = False,
+    semantics: Annotated[str, typer.Option("--semantics", help="crisp or soft")] = "crisp",
+    seed: Annotated[int, typer.Option("--seed", min=0, help="of the environment")] = 0,
+    fps: Annotated[int | None, typer.Option("--fps", min=1, max=50, help="frames per second")] = None,
+    max_steps: Annotated[int | None, typer.Option("--max-steps", min=1, help="cap of the episode")] = None,
+) -> None:
+    """Play one episode and write it as an animated GIF."""
+    if output.suffix.lower() != ".gif":
+        raise ValueError(f"-o {str(output)!r} is not accepted; the file is a .gif")
+    if planner and random:
+        raise ValueError("--planner and --random are not accepted together")
+    if semantics not in ("crisp", "soft"):
+        raise unknown("semantics", semantics, ("crisp", "soft"))
+    with quiet_stdout():
+        steps, success = _render(run_or_name, output, variation, planner, random, semantics, seed, fps, max_steps)
+    typer.echo(f"Wrote {output}: {steps} steps, {'goal reached' if success else 'goal not reached'}", err=True)
+
+
+def _render(
+    name: str,
+    output: Path,
+    pairs: list[str] | None,
+    planner: bool,
+    random: bool,
+    semantics: str,
+    seed: int,
+    fps: int | None,
+    max_steps: int | None,
+) -> tuple[int, bool]:
+    import gymnasium as gym
+
+    from sb3_progpolicy.evaluation import spec_of
+
+    source = _environment_of(name) if planner or random else find_source(name)
+    if source.env_id is None:
+        raise ValueError(f"{name} does not say which environment it is for")
+    variations = parse_variations(pairs) if pairs else default_variations(source.env_id)[-1:]
+    if len(variations) != 1:
+        raise ValueError(f"--set gives {len(variations)} variations; one episode has one")
+    cap = max_steps or spec_of(source.env_id).max_episode_steps
+    if cap is None:
+        raise ValueError(f"{source.env_id} has no cap on steps; give --max-steps")
+    env = gym.make(source.env_id, render_mode="rgb_array", max_episode_steps=cap, **source.env_kwargs)
+    try:
+        observation, info = env.reset(seed=seed, options=variations[0])
+        env.action_space.seed(seed)
+        act = _planner(env) if planner else _random(env) if random else _policy(source, semantics)
+        animation, success = _play(env, act, observation, info.get("optimal_steps"), cap)
+        rate = fps or env.metadata.get("render_fps", 4)
+    finally:
+        env.close()
+    write_atomically(output, animation.gif(rate))
+    return len(animation.frames) - 1, success
+
+
+def _environment_of(name: str) -> Source:
+    """A run or program stands for its environment here, as an id does."""
+    import gymnasium as gym
+
+    from sb3_progpolicy.evaluation import spec_of
+
+    if name in gym.registry or not Path(name).exists():
+        return Source(name, spec_of(name).id, None, None, {})
+    return find_source(name)
+
+
+Act = Callable[[Any, float, bool], Any]
+
+
+def _policy(source: Source, semantics: Any) -> Act:
+    if source.program is None:
+        raise ValueError(f"{source.name} is not a program; render plays programs, planners and random actions")
+    from sb3_progpolicy.programs.interpreter import ProgramRunner, join_inputs
+
+    program, previous = source.program, None
+    runner = ProgramRunner(program, 1, semantics)
+
+    def act(observation: Any, reward: float, done: bool) -> Any:
+        nonlocal previous
+        previous = runner.act(join_inputs(program, observation, previous, reward, done))
+        return previous[0]
+
+    return act
+
+
+def _random(env: Any) -> Act:
+    return lambda observation, reward, done: env.action_space.sample()
+
+
+def _planner(env: Any) -> Act:
+    planned = _planned_actions(env.unwrapped)
+    return lambda observation, reward, done: next(planned)
+
+
+def _planned_actions(env: Any) -> Iterator[int]:
+    """The planner's actions from the environment's present state."""
+    if env.spec.id != "Hanoi-v0":
+        raise ValueError(f"--planner is not accepted for {env.spec.id}; it is for Hanoi-v0")
+    from progpolicy_envs.hanoi import MOVES
+    from progpolicy_envs.planners.hanoi import plan
+
+    return (MOVES.index(move) for move in plan(list(env.discs), env.target))
+
+
+def _play(env: Any, act: Act, observation: Any, optimal: int | None, cap: int) -> tuple[_Animation, bool]:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    animation, reward, done, info = _Animation(env.render()), 0.0, False, dict[str, Any]()
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("playing", total=optimal or cap)
+        while not done:
+            observation, reward, terminated, truncated, info = env.step(act(observation, reward, done))
+            done = terminated or truncated
+            animation.add(env.render())
+            progress.advance(task)
+    return animation, bool(info.get("is_success", False))
+
+
+class _Animation:
+    """Pictures in one palette, so that colours do not flicker and unchanged pixels cost nothing.
+
+    :param frame: the first picture, ``(height, width, 3)`` bytes
+    """
+
+    def __init__(self, frame: Any) -> None:
+        try:
+            from PIL import Image
+        except ImportError:
+            raise ValueError('render needs Pillow: pip install "sb3-progpolicy[render]"') from None
+        self._image = Image
+        self.frames = [Image.fromarray(frame).quantize(64)]
+
+    def add(self, frame: Any) -> None:
+        image = self._image.fromarray(frame)
+        self.frames.append(image.quantize(palette=self.frames[0], dither=self._image.Dither.NONE))
+
+    def gif(self, fps: int) -> bytes:
+        durations = [1000 // fps] * (len(self.frames) - 1) + [int(1000 * LAST_FRAME_SECONDS)]
+        buffer = io.BytesIO()
+        self.frames[0].save(
+            buffer, format="GIF", save_all=True, append_images=self.frames[1:], duration=durations, loop=0
+        )
+        return buffer.getvalue()
