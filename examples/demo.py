@@ -20,8 +20,8 @@ from rich.console import Console
 from rich.table import Table
 
 from sb3_progpolicy import ReptilePPO, evaluate_program
-from sb3_progpolicy.hyperparams import load_hyperparams
 from sb3_progpolicy.programs import Program, ProgramRunner, export_text, join_inputs, plot_program
+from sb3_progpolicy.training import build_model, make_config
 
 ENV = "Hanoi-v0"
 TRAINED_ON = 4
@@ -30,17 +30,17 @@ SIZES = range(1, 9)
 
 def learn_program(timesteps: int | None, seed: int) -> Program:
     """Train on 1-4 discs and return the extracted program."""
-    settings = load_hyperparams("reptile_ppo", ENV)
-    policy, budget = settings.pop("policy"), settings.pop("n_timesteps")
-    model = ReptilePPO(policy, ENV, seed=seed, device="cpu", **settings)
-    model.learn(timesteps or budget, progress_bar=True)
+    config = make_config("reptile_ppo", ENV, seed, timesteps, device="cpu")
+    model, _ = build_model(config)
+    assert isinstance(model, ReptilePPO)
+    model.learn(config.n_timesteps, progress_bar=True)
     return model.program()
 
 
 def results_table(program: Program) -> Table:
     """Run the program on 1-8 discs, both as a real if-then-else (crisp) and as the mixture it was trained as (soft)."""
-    table = Table(title=f"Steps to the goal; trained on 1-{TRAINED_ON} discs, the rest is unseen")
-    for column in ("discs", "optimum", "crisp", "ratio", "soft", "ratio"):
+    table = Table(title=f"Trained on 1-{TRAINED_ON} discs")
+    for column in ("discs", "optimal steps", "crisp", "ratio", "soft", "ratio"):
         table.add_column(column, justify="right")
     variations = [{"n_discs": n_discs} for n_discs in SIZES]
     crisp, soft = (evaluate_program(program, ENV, variations, semantics=name) for name in ("crisp", "soft"))

@@ -11,21 +11,9 @@ parser.add_argument("--timesteps", type=int, default=400_000, help="environment 
 arguments = parser.parse_args()
 
 # For an id of this package, the tasks are the domain's training variations: 1, 2, 3 and 4 discs, any source and target
-# peg. 32 environments are built in one batch. `depth` bounds the length: depth 3 offers programs of 0, 1 and 2
-# conditions, and the search decides between them.
-model = ReptilePPO(
-    "ProgPolicy",
-    "Hanoi-v0",
-    learning_rate=0.01,
-    batch_size=512,
-    n_epochs=10,
-    meta_learning_rate=0.5,
-    search_fraction=0.3,
-    length_coef=0.05,
-    policy_kwargs={"depth": 3, "condition_size": 2},
-    seed=0,
-    device="cpu",
-)
+# peg, and the environments are built as one batch. Programs of 0, 1 and 2 conditions are searched; policy_kwargs with
+# another `depth` searches more or fewer.
+model = ReptilePPO("ProgPolicy", "Hanoi-v0", n_envs=128, n_steps=32, gamma=0.95, ent_coef=0.03, seed=0, device="cpu")
 model.learn(arguments.timesteps, progress_bar=True)
 
 # The most likely program as plain data. Printing it prints the if-then-else.
