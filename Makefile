@@ -1,0 +1,52 @@
+# Every target works as the first command on a machine with Python 3.10+ and make; `make PYTHON=python3.12 test` picks another.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+SOURCES := sb3_progpolicy envs examples benchmarks tests docs
+# Networks this small run faster on one thread each, and the tests on one process per core.
+ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
+
+.PHONY: help install demo test lint format bench docs clean
+
+help:
+	@echo "make demo     train on 1-4 discs, print the program and a table for 1-8 discs"
+	@echo "make test     run the tests"
+	@echo "make lint     ruff and mypy;  make format  applies ruff's fixes"
+	@echo "make bench    measure speed against Stable-Baselines3's own algorithms"
+	@echo "make docs     build the documentation into docs/_build/html"
+	@echo "make install  install into $(VENV); the other targets do so by themselves"
+
+install: $(INSTALLED)
+
+$(INSTALLED): setup.cfg pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and f"Python 3.10 or newer is needed; $(PYTHON) is {sys.version}")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev]"
+	@touch $@
+
+demo: $(INSTALLED)
+	$(ONE_THREAD) $(BIN)/python examples/demo.py
+
+test: $(INSTALLED)
+	$(ONE_THREAD) $(BIN)/python -m pytest -n 2
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check $(SOURCES)
+	$(BIN)/ruff format --check $(SOURCES)
+	$(BIN)/mypy
+
+format: $(INSTALLED)
+	$(BIN)/ruff check --fix $(SOURCES)
+	$(BIN)/ruff format $(SOURCES)
+
+bench: $(INSTALLED)
+	$(ONE_THREAD) $(BIN)/python benchmarks/training_speed.py
+	$(ONE_THREAD) $(BIN)/python benchmarks/recurrence.py
+
+docs: $(INSTALLED)
+	$(BIN)/python -m sphinx -W --keep-going -q docs docs/_build/html
+	@echo "docs/_build/html/index.html"
+
+clean:
+	rm -rf build docs/_build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

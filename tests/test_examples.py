@@ -1,0 +1,64 @@
+"""Every example runs as a user would run it, in a process of its own, with a small budget."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sb3_progpolicy.programs import load_program
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+BUDGET = "4096"
+
+
+def run(script, folder, *arguments):
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, str(EXAMPLES / script), "--timesteps", BUDGET, *arguments]
+    result = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def test_quickstart_prints_the_program_and_its_steps(tmp_path):
+    output = run("quickstart.py", tmp_path)
+    assert "Program" in output
+    assert "optimum: 127.0" in output
+
+
+def test_own_task_domain_trains_a_network_and_a_program(tmp_path):
+    output = run("own_task_domain.py", tmp_path)
+    assert "observation[2]" in output  # the pole's angle, read by the program
+    assert "half-length 1.2 m: network" in output
+
+
+def test_read_and_export_writes_every_format_and_runs_the_exported_file(tmp_path):
+    output = run("read_and_export.py", tmp_path)
+    assert "files in runs/export/" in output
+    written = {path.name for path in (tmp_path / "runs/export").iterdir()}
+    assert written == {"program.json", "program.png", "program.dot", "program.tex", "hanoi_program.py"}
+
+
+def test_read_and_export_takes_a_program_that_there_is(tmp_path):
+    run("read_and_export.py", tmp_path, "--out", "first")
+    run("read_and_export.py", tmp_path, "first/program.json", "--out", "second")
+    assert (tmp_path / "first/program.json").read_bytes() == (tmp_path / "second/program.json").read_bytes()
+
+
+def test_demo_prints_a_table_and_writes_program_picture_and_film(tmp_path):
+    output = run("demo.py", tmp_path)
+    rows = [line for line in output.splitlines() if "│" in line]
+    assert [row.split("│")[1].strip() for row in rows] == [str(n_discs) for n_discs in range(1, 9)]
+    folder = tmp_path / "runs/demo"
+    assert load_program(folder / "program.json").metadata["env"] == "Hanoi-v0"
+    assert (folder / "program.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "hanoi.gif").read_bytes().startswith(b"GIF89a")
+
+
+@pytest.mark.parametrize("script", sorted(path.name for path in EXAMPLES.glob("*.py")))
+def test_every_example_says_what_it_does(script):
+    command = [sys.executable, str(EXAMPLES / script), "--help"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0, result.stderr
+    assert "--timesteps" in result.stdout
