@@ -552,9 +552,9 @@ class ReptilePPO(PPO):
         if not isinstance(self.policy, ProgrammaticActorCritic):
             raise TypeError(f"{type(self.policy).__name__} is not a program; ProgPolicy and PRLPolicy are")
         origin = {"env": self.env_id, "seed": self.seed, "timesteps": self.num_timesteps}
-        return self.policy.program(
-            self.input_names, self.output_names, self.interaction_history, **{**origin, **metadata}
-        )
+        # A saved model's tuples are loaded as lists.
+        inputs, outputs = (tuple(names or ()) for names in (self.input_names, self.output_names))
+        return self.policy.program(inputs, outputs, self.interaction_history, **{**origin, **metadata})
 
     def predict(
         self,
