@@ -291,7 +291,8 @@ class RecurrentProgrammaticPolicy(ProgrammaticActorCritic, RecurrentActorCriticP
         pi_features, vf_features = self._split_features(obs)
         tests, _ = self._tests(pi_features, lstm_states.pi, episode_starts)
         distribution = self._distribution(pi_features, tests)
-        return self._values(vf_features), distribution.log_prob(actions), distribution.entropy()
+        # RecurrentPPO hands MultiBinary actions over as int8, which a Bernoulli distribution does not take.
+        return self._values(vf_features), distribution.log_prob(actions.float()), distribution.entropy()
 
 
 class ProgrammaticPolicy(ProgrammaticActorCritic):

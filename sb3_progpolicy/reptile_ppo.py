@@ -448,6 +448,8 @@ class ReptilePPO(PPO):
         rollout = {name: lay_out(getattr(buffer, name)) for name in names}
         if isinstance(self.action_space, (spaces.Discrete, spaces.MultiDiscrete)):
             rollout["actions"] = rollout["actions"].long()
+        elif isinstance(self.action_space, spaces.MultiBinary):
+            rollout["actions"] = rollout["actions"].float()
         if self.recurrent:
             for part in ("pi", "vf"):
                 for i, kind in enumerate("hc"):

@@ -172,7 +172,7 @@ def test_towards_temperature_zero_the_soft_program_is_the_crisp_one(cell):
     for temperature in (1.0, 0.1, 1e-6):
         module.temperature.fill_(temperature)
         soft, crisp = (parameters_of(module, inputs, crisp=crisp) for crisp in (False, True))
-        distances.append(float((soft - crisp).abs().max()))
+        distances.append((soft - crisp).abs().max().item())
     assert distances[0] > distances[1] > distances[2]
     assert distances[2] < 1e-5
 
