@@ -23,7 +23,7 @@ def egocentric_program() -> Program:
         scores[name] = {AHEAD[name]: OPEN}
         for previous, previous_name in enumerate(ACTION_NAMES):
             scores[name][f"previous {previous_name}"] = PREFERENCE[(direction - previous) % 4]
-    return builder.program(builder.controller(scores), env_id="Hiking-v0")
+    return builder.program(builder.controller(scores), env="Hiking-v0")
 
 
 def right_hand_turn(layout: Layout, cell: int, heading: int) -> int:
