@@ -99,7 +99,7 @@ class Conditions(nn.Module):
         """Return condition ``k`` (0-based) as plain data."""
         if not self.recurrent:
             weight, bias = self.affine.weight[k], self.affine.bias[k]
-            return Condition("affine", (), (), (), (), _vector(weight), float(bias))
+            return Condition("affine", (), (), (), (), _vector(weight), bias.item())
         n_gates = len(GATES[self.cell])
         rows = slice(k * self.size, (k + 1) * self.size)
 
@@ -113,7 +113,7 @@ class Conditions(nn.Module):
             bias_ih=_vector(gates(self.rnn.bias_ih_l0)),
             bias_hh=_vector(gates(self.rnn.bias_hh_l0)),
             readout=_vector(self.readout[k]),
-            readout_bias=float(self.readout_bias[k]),
+            readout_bias=self.readout_bias[k].item(),
         )
 
     def keep(self, n_conditions: int) -> Conditions:

@@ -60,4 +60,4 @@ def map_program(layout: str = "valley") -> Program:
         controllers.append(builder.controller(scores, bias={name: 1.0}))
     came_from = [builder.affine({f"previous {name}": 1.0}, -0.5) for name in ACTION_NAMES[:-1]]
     body = builder.chain(list(zip(came_from, controllers[:-1], strict=True)), controllers[-1])
-    return builder.program(body, env_id="Hiking-v0", layout=layout)
+    return builder.program(body, env="Hiking-v0", layout=layout)
