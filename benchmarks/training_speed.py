@@ -80,7 +80,7 @@ def microseconds(call: Callable[[], Any], n_calls: int) -> float:
     return 1e6 * (time.perf_counter() - start) / n_calls
 
 
-def measure_actions(n_rounds: int, n_calls: int = 2000) -> dict[str, float]:
+def measure_actions(n_rounds: int, n_calls: int = 500) -> dict[str, float]:
     """Return the median microseconds of one action for one environment."""
     model = ReptilePPO("ProgPolicy", ENV, tasks=[TASK], n_envs=N_ENVS, search_fraction=0.0, seed=0, device="cpu")
     # Two conditions at their start values: a larger program than the search usually keeps.

@@ -14,8 +14,9 @@ import numpy as np
 from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_progpolicy import ReptilePPO, ReptileWrapper, TaskDistribution
+from sb3_progpolicy import ReptilePPO, ReptileWrapper, TaskDistribution, VecInteractionHistory
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--timesteps", type=int, default=200_000, help="environment steps of each training")
@@ -47,12 +48,11 @@ tasks = TaskDistribution(
 
 
 def mean_length_of_episodes(model: BaseAlgorithm, length: float, n_episodes: int = 5) -> float:
-    """Run the model on one pole length. A program needs its history, which ReptilePPO keeps in its VecEnv wrapper."""
-    env = make_vec_env(make_env, n_envs=1, seed=1)
+    """Run the model on one pole length. ReptilePPO has seen its previous action, reward and done flag."""
+    env: VecEnv = make_vec_env(make_env, n_envs=1, seed=1)
     env.env_method("set_wrapper_attr", "length", length)
     if isinstance(model, ReptilePPO):
-        model.set_env(env)
-        env = model.get_env()
+        env = VecInteractionHistory(env)
     lengths: list[int] = []
     observation, state, start = env.reset(), None, np.ones(1, dtype=bool)
     while len(lengths) < n_episodes:

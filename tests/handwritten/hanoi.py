@@ -27,4 +27,4 @@ def hanoi_program() -> Program:
         for previous, (_, put_down) in zip(domain.ACTION_NAMES, domain.MOVES, strict=True):
             if put_down == source:
                 scores[move][f"previous {previous}"] = NOT_THE_SAME_DISC
-    return builder.program(builder.controller(scores), env_id="Hanoi-v0")
+    return builder.program(builder.controller(scores), env="Hanoi-v0")

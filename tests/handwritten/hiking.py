@@ -23,7 +23,7 @@ def egocentric_program() -> Program:
         scores[name] = {AHEAD[name]: OPEN}
         for previous, previous_name in enumerate(ACTION_NAMES):
             scores[name][f"previous {previous_name}"] = PREFERENCE[(direction - previous) % 4]
-    return builder.program(builder.controller(scores), env_id="Hiking-v0")
+    return builder.program(builder.controller(scores), env="Hiking-v0")
 
 
 def right_hand_turn(layout: Layout, cell: int, heading: int) -> int:
@@ -60,4 +60,4 @@ def map_program(layout: str = "valley") -> Program:
         controllers.append(builder.controller(scores, bias={name: 1.0}))
     came_from = [builder.affine({f"previous {name}": 1.0}, -0.5) for name in ACTION_NAMES[:-1]]
     body = builder.chain(list(zip(came_from, controllers[:-1], strict=True)), controllers[-1])
-    return builder.program(body, env_id="Hiking-v0", layout=layout)
+    return builder.program(body, env="Hiking-v0", layout=layout)

@@ -27,4 +27,4 @@ def stacking_program() -> Program:
         (plate_lies("row", +1), builder.always("south")),
         (plate_lies("row", -1), builder.always("north")),
     ]
-    return builder.program(builder.chain(branches, builder.always("pick")), env_id="Stacking-v0")
+    return builder.program(builder.chain(branches, builder.always("pick")), env="Stacking-v0")

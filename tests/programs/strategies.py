@@ -74,7 +74,7 @@ def build_program(
         input_names=tuple(f"input {index}[x]" for index in range(n_inputs)),
         output_names=tuple(f"output {index}->" for index in range(action.n_outputs)),
         temperature=float(rng.uniform(0.1, 2)),
-        metadata={"env_id": "Test-v0", "seed": seed, "nested": {"list": [1, 0.1, None, True, "é"]}},
+        metadata={"env": "Test-v0", "seed": seed, "nested": {"list": [1, 0.1, None, True, "é"]}},
     )
 
 
@@ -109,7 +109,7 @@ def hanoi_program(seed: int = 0, cell: Cell = "gru", hidden_size: int = 3, n_con
         interaction=True,
         input_names=names,
         output_names=tuple(moves),
-        metadata={"env_id": "Hanoi-v0"},
+        metadata={"env": "Hanoi-v0"},
     )
 
 

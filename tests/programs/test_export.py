@@ -156,7 +156,7 @@ def test_text_of_a_small_program_reads_like_this():
         action=replace(program.action, sizes=(2,)),
         input_names=("angle", "speed", "cart position"),
         output_names=("left", "stay"),
-        metadata={"env_id": "Cart-v0"},
+        metadata={"env": "Cart-v0"},
     )
     assert export_text(program) == (
         "Program for Cart-v0: 0 conditions, 1 controller.\n"

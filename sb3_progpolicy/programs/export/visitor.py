@@ -103,8 +103,8 @@ def action_rule(action: ActionSpec) -> str:
 
 
 def title(program: Program) -> str:
-    """The program's name, from ``metadata["env_id"]`` where that is a printable string."""
-    environment = program.metadata.get("env_id")
+    """The program's name, from ``metadata["env"]`` where that is a printable string."""
+    environment = program.metadata.get("env")
     known = isinstance(environment, str) and environment.isprintable() and 0 < len(environment) <= 100
     return f"Program for {environment}" if known else "Program"
 

@@ -1,0 +1,64 @@
+"""Sphinx settings, and the pages of the environments, made from their docstrings."""
+
+from __future__ import annotations
+
+import inspect
+from importlib.metadata import version as installed_version
+from pathlib import Path
+
+import gymnasium as gym
+from gymnasium.envs.registration import load_env_creator
+
+from progpolicy_envs import DOMAINS
+
+project = "sb3-progpolicy"
+author = "the sb3-progpolicy developers"
+copyright = author
+release = version = installed_version("sb3-progpolicy")
+
+extensions = ["myst_parser", "sphinx.ext.autodoc"]
+myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]
+myst_heading_anchors = 3
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = f"sb3-progpolicy {release}"
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+python_use_unqualified_type_names = True
+
+ENVIRONMENTS = Path(__file__).parent / "environments"
+IMAGES = Path(__file__).parent / "images"
+
+
+def environment_page(env_id: str) -> str:
+    """Return the page of an environment: its docstring, which is Markdown in Gymnasium's form, and its variations."""
+    spec, domain = gym.spec(env_id), DOMAINS[env_id]
+    entry_point = spec.entry_point
+    creator = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    picture = IMAGES / f"{page_name(env_id)}.png"
+    lines = [f"# {env_id}", ""]
+    if picture.exists():
+        lines += [f"![A state of {env_id}](../images/{picture.name})", ""]
+    lines += [inspect.getdoc(creator) or "", "", "## Variations", ""]
+    for words, variations in (("Training", domain.train), ("Unseen in training, to test on", domain.unseen)):
+        lines += [f"{words}:", "", *(f"* `{variation}`" for variation in variations), ""]
+    return "\n".join(lines)
+
+
+def page_name(env_id: str) -> str:
+    """Return ``hanoi`` for ``Hanoi-v0``."""
+    return env_id.rpartition("-v")[0].lower()
+
+
+def write_environment_pages(app: object) -> None:
+    """Write one page for each domain; unchanged ones are left alone, so that they are not built again."""
+    for env_id in DOMAINS:
+        page, path = environment_page(env_id), ENVIRONMENTS / f"{page_name(env_id)}.md"
+        if not path.exists() or path.read_text(encoding="utf-8") != page:
+            path.write_text(page, encoding="utf-8")
+
+
+def setup(app: object) -> None:
+    """Have the pages written before Sphinx looks for source files."""
+    app.connect("builder-inited", write_environment_pages)  # type: ignore[attr-defined]
