@@ -9,8 +9,12 @@ from progpolicy_envs.domains import DOMAINS, Domain, get_domain
 
 MAX_EPISODE_STEPS = 500
 
-_ENTRY_POINTS = {
+_ENTRY_POINTS: dict[str, tuple[str, str | None]] = {
     "Hanoi-v0": ("progpolicy_envs.hanoi:HanoiEnv", "progpolicy_envs.hanoi:HanoiVectorEnv"),
+    "PandaReach-v0": ("progpolicy_envs.panda:PandaReachEnv", None),
+    "PandaPush-v0": ("progpolicy_envs.panda:PandaPushEnv", None),
+    "PandaSlide-v0": ("progpolicy_envs.panda:PandaSlideEnv", None),
+    "PandaStack-v0": ("progpolicy_envs.panda:PandaStackEnv", None),
 }
 
 

@@ -38,6 +38,20 @@ DOMAINS: dict[str, Domain] = {
             ),
             unseen=tuple({"n_discs": n_discs} for n_discs in (5, 6, 7, 8)),
         ),
+        *(
+            Domain(
+                id=env_id,
+                size=size,
+                train=tuple({size: number} for number in (1, 2, 3)),
+                unseen=tuple({size: number} for number in (4, 5, 6, 7, 8)),
+            )
+            for env_id, size in (
+                ("PandaReach-v0", "n_targets"),
+                ("PandaPush-v0", "n_objects"),
+                ("PandaSlide-v0", "n_objects"),
+                ("PandaStack-v0", "n_objects"),
+            )
+        ),
     )
 }
 
