@@ -59,7 +59,7 @@ class Camera:
         for index, ghost in enumerate(self._targets[:MAX_OBJECTS]):
             shown = index < len(task.targets) and not (isinstance(task, Reach) and task.finished[index])
             self._put(ghost, self._target_position(index) if shown else _AWAY)
-        x, y, z = (task.targets if isinstance(task, Reach) else task.positions)[focus].tolist()
+        x, y, z = (task.targets if isinstance(task, Reach) else task.positions)[focus]
         self._put(self._pin, (x, y, z + 0.1))
         self._put(self._needle, (x, y, z + 0.065))
         middle = (self.scene.table.low_x + self.scene.table.high_x) / 2
@@ -85,7 +85,7 @@ class Camera:
         return self._ghost(pybullet.GEOM_CYLINDER, _pale(colour), radius=self.task.tolerance, length=0.002)
 
     def _target_position(self, index: int) -> tuple[float, float, float]:
-        x, y, z = self.task.targets[index].tolist()
+        x, y, z = self.task.targets[index]
         if isinstance(self.task, Stack):
             # The pattern for the tower stands beside it, where the gripper does not hide it.
             return x + 0.1, y, 0.012 + 0.024 * index

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -21,7 +22,7 @@ from progpolicy_envs.panda.focus import (
     DESIRED_NAMES,
     FEATURE_NAMES,
     OBSERVATION_NAMES,
-    focus_features,
+    focus_observation,
 )
 from progpolicy_envs.panda.scene import CONTROL_STEP, ObjectState, Physics, Scene
 from progpolicy_envs.panda.tasks import Task
@@ -35,6 +36,7 @@ PROGRESS, APPROACH, FINISHED, STEP, FAILURE = 10.0, 5.0, 1.0, -0.01, -5.0
 
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 _STILL = (0.0, 0.0, 0.0)
+_PARTS = (len(FEATURE_NAMES), len(FEATURE_NAMES) + len(ACHIEVED_NAMES))
 
 
 def _box(size: int) -> spaces.Box:
@@ -125,34 +127,29 @@ class PandaEnv(gym.Env[Observation, NDArray[np.float32]]):
         action = np.asarray(action, dtype=np.float32)
         if action.shape != self.action_space.shape or not np.isfinite(action).all():
             raise ValueError(f"action={action!r} is not accepted; an action is 4 finite numbers from -1 to 1")
-        task, index, achieved, finished = self.task, self._focus, self._achieved, task_finished(self.task)
+        task, index, achieved, n_left = self.task, self._focus, self._achieved, self._n_left
         reach = self._reach
         self.scene.robot.act(action)
         self.scene.step()
         task.update(self.scene)
-        shaping = STEP + APPROACH * (reach - self._handle_distance(index))
-        shaping += FINISHED * (task_finished(task) - finished)
-        moved = task.positions[index]
-        success, failure = bool(task.finished.all()), task.failed
-        shaping += FAILURE * failure
+        shaping = STEP + APPROACH * (reach - self._handle_distance(index)) + FAILURE * task.failed
         self._look()
+        shaping += FINISHED * (n_left - self._n_left)
         if self._focus != index:
             # The new object has made no progress yet; that of the old one goes into the shaping.
             target = task.targets[index]
-            shaping += PROGRESS * float(np.linalg.norm(achieved - target) - np.linalg.norm(moved - target))
+            shaping += PROGRESS * (math.dist(achieved, target) - math.dist(task.positions[index], target))
             achieved = self._achieved
         info = {
-            "is_success": success,
-            "is_failure": failure,
+            "is_success": self._n_left == 0,
+            "is_failure": task.failed,
             "settled": task.settled(self.scene, self._focus),
-            "previous_achieved_goal": achieved.astype(np.float32),
+            "previous_achieved_goal": achieved,
             "shaping": shaping,
         }
-        reward = float(
-            self._reward(self._achieved.astype(np.float32), self._desired.astype(np.float32), info)
-        )
         self._show()
-        return self._observe(), reward, success or failure, False, info
+        terminated = info["is_success"] or info["is_failure"]
+        return self._observe(), self._reward(info), terminated, False, info
 
     def render(self) -> Any:
         """Return a picture ``(360, 480, 3)`` of bytes, or show a window, as ``render_mode`` says."""
@@ -166,62 +163,38 @@ class PandaEnv(gym.Env[Observation, NDArray[np.float32]]):
         self.scene.close()
         self._display.close()
 
-    def _reward(
-        self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Mapping[str, Any] | Sequence[Any]
-    ) -> NDArray[np.float64] | np.float64:
-        """Return the reward of one step or of many, also for goals other than the one pursued.
-
-        :param achieved_goal: ``(3,)`` or ``(n, 3)``
-        :param desired_goal: like ``achieved_goal``
-        :param info: the step's info, or a sequence of ``n``
-        :return: one number or ``(n,)``
-        :raises ValueError: for the dense reward, if an info lacks ``"previous_achieved_goal"`` and ``"shaping"``
-        """
-        one = isinstance(info, Mapping)
-        infos: Sequence[Mapping[str, Any]] = [info] if one else info  # type: ignore[list-item, assignment]
-        achieved, desired = np.atleast_2d(achieved_goal), np.atleast_2d(desired_goal)
-        distance = np.linalg.norm(achieved - desired, axis=-1)
+    def _reward(self, info: Mapping[str, Any]) -> float:
+        """Return the reward of the present step; :meth:`GoalForm.compute_reward` is the same for many goals."""
+        distance = math.dist(self._achieved, self._desired)
         if self.reward_type == "sparse":
-            settled = np.array([entry.get("settled", True) for entry in infos], dtype=bool)
-            reward = np.where((distance < self.task.tolerance) & settled, 0.0, -1.0)
-        else:
-            try:
-                previous = np.array([entry["previous_achieved_goal"] for entry in infos])
-                shaping = np.array([entry["shaping"] for entry in infos])
-            except KeyError as error:
-                raise ValueError(
-                    f"info lacks {error}, which the dense reward needs; HerReplayBuffer keeps it with "
-                    'copy_info_dict=True, or use reward_type="sparse"'
-                ) from error
-            reward = PROGRESS * (np.linalg.norm(previous - desired, axis=-1) - distance) + shaping
-        return reward[0] if one else reward
+            return 0.0 if distance < self.task.tolerance and info["settled"] else -1.0
+        return PROGRESS * (math.dist(info["previous_achieved_goal"], self._desired) - distance) + info["shaping"]
 
     def _look(self) -> None:
         """Turn to the object in focus and remember its state, from which progress is measured."""
         self._focus = self.task.focus
+        self._n_left = self.task.finished.count(False)
         self._achieved = self.task.positions[self._focus]
         self._desired = self.task.targets[self._focus]
         self._reach = self._handle_distance(self._focus)
 
     def _handle_distance(self, index: int) -> float:
         handle = self.task.handle(index)
-        return 0.0 if handle is None else float(np.linalg.norm(handle - self.scene.robot.position))
+        return 0.0 if handle is None else math.dist(handle, self.scene.robot.position)
 
     def _focus_state(self) -> ObjectState:
         """Return the object in focus; in Reach the gripper itself, in Slide a delivered puck where it was delivered."""
-        position = self._achieved.tolist()
         if self.task.kind is None:
-            return ObjectState(position, _UPRIGHT, self.scene.robot.velocity.tolist(), _STILL)
+            return ObjectState(self._achieved, _UPRIGHT, self.scene.robot.velocity, _STILL)
         state = self.scene.object_state(self._focus)
-        return ObjectState(position, state.orientation, state.velocity, state.spin)
+        return ObjectState(self._achieved, state.orientation, state.velocity, state.spin)
 
     def _observe(self) -> Observation:
-        n_left = int(np.count_nonzero(~self.task.finished))
-        features = focus_features(self.scene.robot, self._focus_state(), self._desired, n_left)
-        achieved, desired = self._achieved.astype(np.float32), self._desired.astype(np.float32)
+        observation = focus_observation(self.scene.robot, self._focus_state(), self._desired, self._n_left)
         if self.observation == "goal":
+            features, achieved, desired = np.split(observation, _PARTS)
             return {"observation": features, "achieved_goal": achieved, "desired_goal": desired}
-        return np.concatenate((features, achieved, desired))
+        return observation
 
     def _show(self) -> None:
         if self.render_mode == "human" and self._camera is not None:
@@ -242,7 +215,24 @@ class GoalForm(GoalEnv):
         :return: one number or ``(n,)``
         :raises ValueError: for the dense reward, if an info lacks ``"previous_achieved_goal"`` or ``"shaping"``
         """
-        return self._reward(achieved_goal, desired_goal, info)  # type: ignore[attr-defined, no-any-return]
+        one = isinstance(info, Mapping)
+        infos: Sequence[Mapping[str, Any]] = [info] if one else info  # type: ignore[list-item, assignment]
+        achieved, desired = np.atleast_2d(achieved_goal), np.atleast_2d(desired_goal)
+        distance = np.linalg.norm(achieved - desired, axis=-1)
+        if self.reward_type == "sparse":
+            settled = np.array([entry.get("settled", True) for entry in infos], dtype=bool)
+            reward = np.where((distance < self.task.tolerance) & settled, 0.0, -1.0)
+        else:
+            try:
+                previous = np.array([entry["previous_achieved_goal"] for entry in infos])
+                shaping = np.array([entry["shaping"] for entry in infos])
+            except KeyError as error:
+                raise ValueError(
+                    f"info lacks {error}, which the dense reward needs; HerReplayBuffer keeps it with "
+                    'copy_info_dict=True, or use reward_type="sparse"'
+                ) from error
+            reward = PROGRESS * (np.linalg.norm(previous - desired, axis=-1) - distance) + shaping
+        return reward[0] if one else reward
 
     def compute_terminated(
         self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Mapping[str, Any]
@@ -260,11 +250,6 @@ class GoalForm(GoalEnv):
 @cache
 def _goal_form(env_class: type[PandaEnv]) -> type[PandaEnv]:
     return type(env_class.__name__, (GoalForm, env_class), {"__doc__": env_class.__doc__})
-
-
-def task_finished(task: Task) -> int:
-    """Return how many objects are finished."""
-    return int(np.count_nonzero(task.finished))
 
 
 def _check_choice(name: str, value: Any, choices: Sequence[Any]) -> None:

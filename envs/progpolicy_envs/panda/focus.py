@@ -1,4 +1,4 @@
-"""The focus observation: the robot and one object with its target in 26 numbers, at any number of objects."""
+"""The focus observation: the robot and one object with its target in 32 numbers, at any number of objects."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progpolicy_envs.panda.robot import PandaRobot
-from progpolicy_envs.panda.scene import MAX_OBJECTS, ObjectState
+from progpolicy_envs.panda.scene import MAX_OBJECTS, ObjectState, Point
 
 FEATURE_NAMES = (
     *("gripper_x", "gripper_y", "gripper_z"),
@@ -33,19 +33,19 @@ ACTION_NAMES = ("move_x", "move_y", "move_z", "open")
 BOUND = 10.0
 
 
-def focus_features(
-    robot: PandaRobot, state: ObjectState, target: NDArray[np.float64], n_left: int
+def focus_observation(
+    robot: PandaRobot, state: ObjectState, target: Point, n_left: int
 ) -> NDArray[np.float32]:
-    """Return the 26 numbers of the observation, in the order of :data:`FEATURE_NAMES`.
+    """Return the 32 numbers of the observation, in the order of :data:`OBSERVATION_NAMES`.
 
     :param robot: the robot
     :param state: the object in focus
-    :param target: its target ``(3,)``
+    :param target: its target, metres
     :param n_left: how many objects are unfinished
     """
-    gx, gy, gz = robot.position.tolist()
+    gx, gy, gz = robot.position
     x, y, z = state.position
-    tx, ty, tz = target.tolist()
+    tx, ty, tz = target
     line_x, line_y = tx - x, ty - y
     distance = math.hypot(line_x, line_y)
     if distance > 1e-9:
@@ -55,7 +55,7 @@ def focus_features(
     yaw = math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
     features = (
         *(gx, gy, gz),
-        *robot.velocity.tolist(),
+        *robot.velocity,
         robot.width,
         *(dx, dy, z - gz),
         *(tx - gx, ty - gy, tz - gz),
@@ -68,5 +68,7 @@ def focus_features(
         state.spin[2],
         math.hypot(dx, dy),
         n_left / MAX_OBJECTS,
+        *(x, y, z),
+        *(tx, ty, tz),
     )
-    return np.array([min(BOUND, max(-BOUND, feature)) for feature in features], dtype=np.float32)
+    return np.minimum(np.maximum(np.array(features, dtype=np.float32), -BOUND), BOUND)

@@ -63,8 +63,7 @@ class PandaRobot:
             )
         self._gains = [motor_gain(time_step)] * len(_JOINTS)
         self._neutral = np.array(_NEUTRAL[: len(_ARM)])
-        self.position: NDArray[np.float64] = np.zeros(3)
-        self.velocity: NDArray[np.float64] = np.zeros(3)
+        self.position = self.velocity = (0.0, 0.0, 0.0)
         self.width = 0.0
         self.place()
         self.read()
@@ -79,8 +78,8 @@ class PandaRobot:
         """Take over the state of the simulation; two calls of PyBullet in all."""
         self._joints = [state[0] for state in pybullet.getJointStates(self.body, _JOINTS, physicsClientId=self.client)]
         link = pybullet.getLinkState(self.body, _GRIPPER, computeLinkVelocity=True, physicsClientId=self.client)
-        self.position = np.array(link[0])
-        self.velocity = np.array(link[6])
+        self.position = link[0]
+        self.velocity = link[6]
         self._orientation = link[1]
         self.width = self._joints[-1] + self._joints[-2]
 

@@ -6,11 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import numpy as np
 import pybullet
 import pybullet_data
-from numpy.typing import NDArray
-
 from progpolicy_envs.panda.robot import PandaRobot
 
 MAX_OBJECTS = 8
@@ -19,6 +16,8 @@ CONTROL_STEP = 1 / 30
 TABLE_HEIGHT = 0.4
 #: An object whose centre is this far below the table's top has left the table, metres.
 FALL_DEPTH = 0.05
+
+Point = tuple[float, float, float]
 
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 _STILL = (0.0, 0.0, 0.0)
@@ -116,11 +115,12 @@ class Scene:
         self.n_objects = 0
         self.client = pybullet.connect(pybullet.DIRECT)
         self._build(visual)
-        self.positions: NDArray[np.float64] = np.zeros((0, 3))
+        #: Centres of the objects in use.
+        self.positions: list[Point] = []
         # The first passes bring the engine's hidden caches to where every later reset leaves them.
         self._saved = pybullet.saveState(physicsClientId=self.client)
         for _ in range(2):
-            self.place(np.zeros((0, 3)))
+            self.place([])
 
     def _build(self, visual: bool) -> None:
         client = self.client
@@ -185,12 +185,12 @@ class Scene:
         """Height of the centre of an object that lies on the table, metres."""
         return self.kind.height if self.kind else 0.0
 
-    def place(self, positions: NDArray[np.float64]) -> None:
+    def place(self, positions: Sequence[Point]) -> None:
         """Put the robot into its neutral pose and objects onto the table, all at rest; the rest of the world is as new.
 
         Objects that lie on the table start asleep.
 
-        :param positions: ``(n_objects, 3)`` metres, no two overlapping
+        :param positions: the centres of the objects, metres, no two overlapping
         """
         for index, body in enumerate(self.objects):
             self._move(body, (10.0 + index, 0.0, -10.0))
@@ -203,8 +203,8 @@ class Scene:
         self.n_objects = len(positions)
         for index, body in enumerate(self.objects):
             parked = index >= self.n_objects
-            self._move(body, (10.0 + index, 0.0, -10.0) if parked else positions[index].tolist())
-            lies = parked or positions[index, 2] == self.rest_height
+            self._move(body, (10.0 + index, 0.0, -10.0) if parked else positions[index])
+            lies = parked or positions[index][2] == self.rest_height
             if parked or (lies and self.physics.sleeping):
                 self._activate(body, pybullet.ACTIVATION_STATE_SLEEP)
         pybullet.performCollisionDetection(physicsClientId=self.client)
@@ -228,7 +228,7 @@ class Scene:
         self.robot.read()
         read, client = pybullet.getBasePositionAndOrientation, self.client
         self._poses = [read(body, client) for body in self.objects[: self.n_objects]]
-        self.positions = np.array([pose[0] for pose in self._poses]).reshape(-1, 3)
+        self.positions = [pose[0] for pose in self._poses]
 
     def object_state(self, index: int) -> ObjectState:
         """Return the full state of one object."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,27 +17,25 @@ from progpolicy_envs.panda.placement import (
     reachable,
     sample_in_order,
 )
-from progpolicy_envs.panda.scene import FALL_DEPTH, ObjectKind, Scene, Table
-
-Point = NDArray[np.float64]
+from progpolicy_envs.panda.scene import FALL_DEPTH, ObjectKind, Point, Scene, Table
 
 
 class Task(ABC):
     """One task and its state in the running episode.
 
-    Attributes: ``targets`` ``(n, 3)``, ``finished`` ``(n,)`` and ``positions`` ``(n, 3)``, what is to be brought to
-    the targets.
+    A few numbers are read at every step, so they are plain floats rather than arrays: ``positions``, of what is to be
+    brought to the targets, ``targets`` and ``finished`` have one entry per object.
     """
 
-    table: Table = Table()
-    kind: ObjectKind | None = None
+    table: ClassVar[Table] = Table()
+    kind: ClassVar[ObjectKind | None] = None
     #: Distance from the target within which an object counts as there, metres.
-    tolerance: float = 0.05
+    tolerance: ClassVar[float] = 0.05
 
     def __init__(self) -> None:
-        self.targets: Points = np.zeros((0, 3))
-        self.positions: Points = np.zeros((0, 3))
-        self.finished: NDArray[np.bool_] = np.zeros(0, dtype=bool)
+        self.positions: list[Point] = []
+        self.targets: list[Point] = []
+        self.finished: list[bool] = []
 
     def reset(self, scene: Scene, rng: np.random.Generator, n_objects: int) -> None:
         """Draw starts and targets and place the objects.
@@ -44,28 +44,29 @@ class Task(ABC):
         :param rng: the only source of chance
         :param n_objects: how many objects, or targets of Reach
         """
-        starts, self.targets = self.sample(rng, n_objects)
-        scene.place(starts)
-        self.finished = np.zeros(n_objects, dtype=bool)
+        starts, targets = self.sample(rng, n_objects)
+        scene.place([tuple(start) for start in starts.tolist()])
+        self.targets = [tuple(target) for target in targets.tolist()]
+        self.finished = [False] * n_objects
         self.positions = self._positions(scene)
 
     def update(self, scene: Scene) -> None:
         """Take over the state of the world after a control step."""
         self.positions = self._positions(scene)
-        self.finished = self._finished(scene)
+        self.finished = [self._is_finished(scene, index) for index in range(len(self.targets))]
 
     @property
     def focus(self) -> int:
         """Index of the first unfinished object in colour order; the last one when all are finished."""
-        return int(self.finished.argmin()) if not self.finished.all() else len(self.finished) - 1
+        return self.finished.index(False) if not all(self.finished) else len(self.finished) - 1
 
     @property
     def failed(self) -> bool:
         """Whether an object has left the table."""
-        return bool((self.positions[:, 2] < -FALL_DEPTH).any())
+        return any(position[2] < -FALL_DEPTH for position in self.positions)
 
     def settled(self, scene: Scene, index: int) -> bool:
-        """Return whether an object at its target would count as finished, as far as the gripper is concerned."""
+        """Return whether an object, if it is at its target, is finished as far as all else is concerned."""
         return True
 
     @abstractmethod
@@ -74,14 +75,13 @@ class Task(ABC):
 
     @abstractmethod
     def handle(self, index: int) -> Point | None:
-        """Return the point ``(3,)`` from which the gripper works on an object; ``None`` where there is none."""
+        """Return the point from which the gripper works on an object; ``None`` where there is none."""
 
-    def _positions(self, scene: Scene) -> Points:
+    def _positions(self, scene: Scene) -> list[Point]:
         return scene.positions
 
-    def _finished(self, scene: Scene) -> NDArray[np.bool_]:
-        offsets = self.positions - self.targets
-        return (offsets * offsets).sum(axis=1) < self.tolerance**2
+    def _is_finished(self, scene: Scene, index: int) -> bool:
+        return math.dist(self.positions[index], self.targets[index]) < self.tolerance
 
 
 class Reach(Task):
@@ -106,14 +106,12 @@ class Reach(Task):
         """Return ``None``: the gripper itself is what moves."""
         return None
 
-    def _positions(self, scene: Scene) -> Points:
-        return np.broadcast_to(scene.robot.position, self.targets.shape)
+    def _positions(self, scene: Scene) -> list[Point]:
+        return [scene.robot.position] * len(self.targets)
 
-    def _finished(self, scene: Scene) -> NDArray[np.bool_]:
-        finished = self.finished.copy()
-        index = self.focus
-        finished[index] |= bool(np.linalg.norm(scene.robot.position - self.targets[index]) < self.tolerance)
-        return finished
+    def _is_finished(self, scene: Scene, index: int) -> bool:
+        # The list is being rebuilt in order, so a target counts only once those before it have been visited.
+        return self.finished[index] or (index == self.focus and super()._is_finished(scene, index))
 
 
 class Push(Task):
@@ -154,23 +152,25 @@ class Slide(Task):
 
     table = Table(low_x=-0.8, high_x=0.6)
     kind = ObjectKind("cylinder", (0.03, 0.03, 0.015), mass=1.0, friction=0.04)
-    separation, clearance = 0.1, 0.085
-    run_up = 0.09
+    clearance = 0.08
+    run_up = 0.06
+    #: Half axes of the ellipse around a puck in which no other starts; longer along x, the way to the targets.
+    separation = np.array([0.14, 0.1])
     #: Tangent of the largest angle between the x axis and the way to the target.
     slope = 0.4
 
     def sample(self, rng: np.random.Generator, n_objects: int) -> tuple[Points, Points]:
         """Return pucks near the robot and targets out of its reach, the ways in colour order free."""
 
-        def propose_starts(number: int) -> tuple[Points, Points]:
-            starts = rng.uniform((-0.3, -0.28), (-0.02, 0.28), (number, 2))
+        def propose(number: int) -> tuple[Points, Points]:
+            starts = rng.uniform((-0.32, -0.28), (0, 0.28), (number, 2))
             return starts, starts
 
-        def apart(starts: Points, _: Points, before: Points, __: Points) -> NDArray[np.bool_]:
-            return reachable(starts) & (distances(starts, before) > self.separation)
+        def accept(starts: Points, _: Points, before: Points, __: Points) -> NDArray[np.bool_]:
+            return reachable(starts) & (distances(starts / self.separation, before / self.separation) > 1)
 
         while True:
-            starts = sample_in_order(n_objects, propose_starts, apart)[0]
+            starts = sample_in_order(n_objects, propose, accept)[0]
             # The front pucks come first, so that they do not bar the way of those behind them.
             starts = starts[np.argsort(-starts[:, 0])]
             targets = self._sample_targets(rng, starts)
@@ -181,7 +181,7 @@ class Slide(Task):
         """Return targets ``(m, 2)`` for the first m pucks; fewer than there are pucks where one finds no place."""
         targets = np.zeros((0, 2))
         for index, start in enumerate(starts):
-            candidates = rng.uniform((0.3, -0.28), (0.54, 0.28), (256, 2))
+            candidates = rng.uniform((0.3, -0.29), (0.54, 0.29), (128, 2))
             ways = candidates - start
             run_up = extended(start, candidates, self.run_up)
             fits = np.abs(ways[:, 1]) < self.slope * ways[:, 0]
@@ -196,21 +196,23 @@ class Slide(Task):
         """Take over the state of the world and take delivered pucks off the table."""
         before = self.finished
         super().update(scene)
-        for index in np.flatnonzero(self.finished & ~before):
-            scene.park(int(index))
+        for index, (old, new) in enumerate(zip(before, self.finished, strict=True)):
+            if new and not old:
+                scene.park(index)
 
     def handle(self, index: int) -> Point:
         """Return the point behind the puck on the line to its target."""
         return _behind(self.positions[index], self.targets[index], 0.06)
 
-    def _positions(self, scene: Scene) -> Points:
+    def _positions(self, scene: Scene) -> list[Point]:
         # A delivered puck keeps the place where it was delivered, although it is off the table.
-        return np.where(self.finished[:, None], self.positions, scene.positions) if self.finished.any() else (
-            scene.positions
-        )
+        if not any(self.finished):
+            return scene.positions
+        places = zip(self.finished, self.positions, scene.positions, strict=True)
+        return [old if finished else new for finished, old, new in places]
 
-    def _finished(self, scene: Scene) -> NDArray[np.bool_]:
-        return self.finished | super()._finished(scene)
+    def _is_finished(self, scene: Scene, index: int) -> bool:
+        return self.finished[index] or super()._is_finished(scene, index)
 
 
 class Stack(Task):
@@ -223,7 +225,7 @@ class Stack(Task):
 
     def __init__(self) -> None:
         super().__init__()
-        self._before: Points = self.positions
+        self._before: list[Point] = []
 
     def sample(self, rng: np.random.Generator, n_objects: int) -> tuple[Points, Points]:
         """Return blocks that the open gripper can pick up and their places in a tower beside them."""
@@ -233,7 +235,7 @@ class Stack(Task):
             starts = rng.uniform((-0.32, -0.28), (0.08, 0.28), (number, 2))
             return starts, np.broadcast_to(foot, starts.shape)
 
-        def accept(starts: Points, targets: Points, before: Points, done: Points) -> NDArray[np.bool_]:
+        def accept(starts: Points, targets: Points, before: Points, _: Points) -> NDArray[np.bool_]:
             x, y = (starts - targets).T
             # The wrist behind the gripper must not meet the tower, nor the hand, which is 20 cm wide.
             fits = ((x < -0.1) | (np.abs(y) > 0.2)) & reachable(starts)
@@ -251,34 +253,31 @@ class Stack(Task):
 
     def update(self, scene: Scene) -> None:
         """Take over the state of the world after a control step."""
-        super().update(scene)
         self._before = self.positions
+        super().update(scene)
 
     def handle(self, index: int) -> Point:
         """Return the block's own position."""
         return self.positions[index]
 
     def settled(self, scene: Scene, index: int) -> bool:
-        """Return whether the block is at rest and the gripper away from it."""
-        return bool(self._at_rest()[index] and self._released(scene)[index])
+        """Return whether the block is at rest and free of the gripper: fingertips above it, or beside it."""
+        x, y, z = self.positions[index]
+        gripper_x, gripper_y, gripper_z = scene.robot.position
+        free = gripper_z - z > 0.03 or math.hypot(gripper_x - x, gripper_y - y) > 0.06
+        return free and math.dist(self.positions[index], self._before[index]) < self.rest_motion
 
-    def _finished(self, scene: Scene) -> NDArray[np.bool_]:
-        return super()._finished(scene) & self._at_rest() & self._released(scene)
-
-    def _at_rest(self) -> NDArray[np.bool_]:
-        return np.abs(self.positions - self._before).max(axis=1) < self.rest_motion
-
-    def _released(self, scene: Scene) -> NDArray[np.bool_]:
-        # A block is free of the gripper when the fingertips are above it or the gripper is beside it.
-        x, y, z = (scene.robot.position - self.positions).T
-        return (z > 0.03) | (x * x + y * y > 0.06**2)
+    def _is_finished(self, scene: Scene, index: int) -> bool:
+        return super()._is_finished(scene, index) and self.settled(scene, index)
 
 
 def _on_table(starts: Points, targets: Points, height: float) -> tuple[Points, Points]:
-    return tuple(np.column_stack((points, np.full(len(points), height))) for points in (starts, targets))  # type: ignore[return-value]
+    heights = np.full((len(starts), 1), height)
+    return np.hstack((starts, heights)), np.hstack((targets, heights))
 
 
 def _behind(position: Point, target: Point, back: float) -> Point:
-    way = target - position
-    length = max(float(np.hypot(way[0], way[1])), 1e-6)
-    return position - (back / length) * np.array((way[0], way[1], 0.0))
+    x, y, z = position
+    way_x, way_y = target[0] - x, target[1] - y
+    share = back / max(math.hypot(way_x, way_y), 1e-6)
+    return x - share * way_x, y - share * way_y, z
