@@ -26,8 +26,9 @@ _NEUTRAL = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79, 0.0, 0.0)
 # Limits of the joints in the URDF, drawn in a little so that the motors do not work against the stops.
 _LOWER = np.array([-2.9671, -1.8326, -2.9671, -3.1416, -2.9671, -0.0873, -2.9671]) + 0.01
 _UPPER = np.array([2.9671, 1.8326, 2.9671, 0.0, 2.9671, 3.8223, 2.9671]) - 0.01
-# PyBullet's position motor removes this share of the error in each substep of 1/500 s, panda-gym's; see motor_gain.
-_GAIN_AT_500_HZ = 0.1
+# PyBullet's position motor removes this share of the error in each physics step of 1/240 s; see motor_gain. Stiffer
+# motors run into their torque limits and swing the arm off its line without arriving sooner.
+_GAIN_AT_240_HZ = 0.1
 _DAMPING = 1e-3
 _POSTURE_GAIN = 0.1
 
@@ -40,7 +41,7 @@ def motor_gain(time_step: float) -> float:
 
     :param time_step: seconds
     """
-    return 1 - (1 - _GAIN_AT_500_HZ) ** (500 * time_step)
+    return 1 - (1 - _GAIN_AT_240_HZ) ** (240 * time_step)
 
 
 class PandaRobot:

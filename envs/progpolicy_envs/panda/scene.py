@@ -117,10 +117,7 @@ class Scene:
         self._build(visual)
         #: Centres of the objects in use.
         self.positions: list[Point] = []
-        # The first passes bring the engine's hidden caches to where every later reset leaves them.
-        self._saved = pybullet.saveState(physicsClientId=self.client)
-        for _ in range(2):
-            self.place([])
+        self.place([])
 
     def _build(self, visual: bool) -> None:
         client = self.client
@@ -193,27 +190,28 @@ class Scene:
         :param positions: the centres of the objects, metres, no two overlapping
         """
         for index, body in enumerate(self.objects):
-            self._move(body, (10.0 + index, 0.0, -10.0))
-            self._activate(body, pybullet.ACTIVATION_STATE_WAKE_UP)
+            self._move(body, _parking(index))
         self.robot.place()
-        # Apart from each other nothing touches: contacts and their warm starts are forgotten, sleepers wake up.
-        pybullet.stepSimulation(physicsClientId=self.client)
-        pybullet.restoreState(self._saved, physicsClientId=self.client)
+        # Apart from each other nothing touches: contacts and their warm starts are forgotten. A body takes a step to
+        # wake up and another to fall asleep, so that all enter the episode alike, asleep before anything moves them.
+        for state in (pybullet.ACTIVATION_STATE_WAKE_UP, pybullet.ACTIVATION_STATE_SLEEP):
+            for body in self.objects:
+                self._activate(body, state)
+            pybullet.stepSimulation(physicsClientId=self.client)
         self.robot.place()
         self.n_objects = len(positions)
         for index, body in enumerate(self.objects):
-            parked = index >= self.n_objects
-            self._move(body, (10.0 + index, 0.0, -10.0) if parked else positions[index])
-            lies = parked or positions[index][2] == self.rest_height
-            if parked or (lies and self.physics.sleeping):
-                self._activate(body, pybullet.ACTIVATION_STATE_SLEEP)
+            used = index < self.n_objects
+            self._move(body, positions[index] if used else _parking(index))
+            if used and not (self.physics.sleeping and positions[index][2] == self.rest_height):
+                self._activate(body, pybullet.ACTIVATION_STATE_WAKE_UP)
         pybullet.performCollisionDetection(physicsClientId=self.client)
         self.read()
 
     def park(self, index: int) -> None:
         """Take an object off the table for the rest of the episode."""
         body = self.objects[index]
-        self._move(body, (10.0 + index, 0.0, -10.0))
+        self._move(body, _parking(index))
         self._activate(body, pybullet.ACTIVATION_STATE_SLEEP)
 
     def step(self) -> None:
@@ -247,3 +245,8 @@ class Scene:
 
     def _activate(self, body: int, state: Any) -> None:
         pybullet.changeDynamics(body, -1, activationState=state, physicsClientId=self.client)
+
+
+def _parking(index: int) -> Point:
+    """Return a place where an object meets nothing."""
+    return 10.0 + index, 0.0, -10.0
