@@ -51,56 +51,46 @@ def reach(observation: Observation) -> Action:
 
 
 def push(observation: Observation) -> Action:
-    """Go behind the block, down, and along the line to its target.
+    """Take the block between the fingers and push it over the table in a straight line.
+
+    Between the fingers because a cube that is pushed across a corner turns and slips away.
 
     :param observation: ``(32,)``
     :return: ``(4,)``
     """
     view = _View(observation)
-    dx, dy, _ = view.to_object
-    line_x, line_y = view.line
-    back = 0.065
-    ahead_x, ahead_y = dx - back * line_x, dy - back * line_y
-    height = view.gripper[2]
-    down = 0.02 - height
-    if height < 0.05 and -0.12 < view.along < -0.02 and abs(view.across) < 0.025:
-        speed = min(0.03, 0.01 + 0.3 * view.distance)
-        side_x, side_y = dx + view.along * line_x, dy + view.along * line_y
-        return _action(speed * line_x + 0.8 * side_x, speed * line_y + 0.8 * side_y, down, _CLOSE)
-    if math.hypot(ahead_x, ahead_y) < 0.015:
-        return _action(ahead_x, ahead_y, down, _CLOSE)
-    if height < 0.07:
-        return _action(0.0, 0.0, _STEP, _CLOSE)
-    return _action(ahead_x, ahead_y, _CLEAR - height, _CLOSE)
+    if _holds(view):
+        speed = min(0.04, 0.01 + 0.3 * view.distance)
+        return _action(speed * view.line[0], speed * view.line[1], 0.02 - view.gripper[2], _CLOSE)
+    if view.reach > 0.03 and view.gripper[2] < 0.07:
+        return _leave(view)
+    return _approach(view, _CLEAR)
 
 
 def slide(observation: Observation) -> Action:
-    """Take the puck between the half-open fingers from behind, accelerate it towards its target and let go.
+    """Take the puck between the half-open fingers from behind, accelerate it towards its target and stop.
+
+    The two fingers keep the puck in their middle, so that it leaves in the direction in which the gripper goes.
 
     :param observation: ``(32,)``
     :return: ``(4,)``
     """
     view = _View(observation)
     dx, dy, _ = view.to_object
-    line_x, line_y = view.line
-    back = 0.06
-    ahead_x, ahead_y = dx - back * line_x, dy - back * line_y
     height = view.gripper[2]
     down = 0.012 - height
     fingers = (0.04 - view.width) / 0.2
-    moving = math.hypot(*view.object_velocity[:2]) > 0.05
-    if height < 0.03 and -0.12 < view.along < 0.0 and abs(view.across) < 0.03:
-        if view.gripper[0] > 0.1:
-            return _action(0.0, 0.0, _STEP, fingers)
-        side_x, side_y = dx + view.along * line_x, dy + view.along * line_y
-        return _action(0.035 * line_x + 0.5 * side_x, 0.035 * line_y + 0.5 * side_y, down, fingers)
-    if moving:
+    outside = math.hypot(view.gripper[0] + 0.6, view.gripper[1]) > 0.69
+    if height < 0.03 and 0.0 < dx < 0.08 and abs(dy) < 0.02 and not outside:
+        speed = min(0.045, 0.25 * (0.12 - dx))
+        return _action(speed * view.line[0], speed * view.line[1], down, fingers)
+    if outside and height < 0.07 or math.hypot(*view.object_velocity[:2]) > 0.05:
         return _action(0.0, 0.0, _CLEAR - height, fingers)
-    if math.hypot(ahead_x, ahead_y) < 0.012:
-        return _action(ahead_x, ahead_y, down, fingers)
+    if abs(dx - 0.06) < 0.012 and abs(dy) < 0.008:
+        return _action(dx - 0.06, dy, down, fingers)
     if height < 0.07:
         return _action(0.0, 0.0, _STEP, fingers)
-    return _action(ahead_x, ahead_y, _CLEAR - height, fingers)
+    return _action(dx - 0.06, dy, _CLEAR - height, fingers)
 
 
 def stack(observation: Observation) -> Action:
@@ -110,32 +100,42 @@ def stack(observation: Observation) -> Action:
     :return: ``(4,)``
     """
     view = _View(observation)
-    dx, dy, dz = view.to_object
-    tx, ty, _ = view.to_target
     height, top = view.gripper[2], view.target[2]
     way_x, way_y = view.target[0] - view.object[0], view.target[1] - view.object[1]
-    near_tower = math.hypot(tx, ty) < 0.13
-    around = view.reach < 0.015 and abs(dz) < 0.015
+    near_tower = math.hypot(*view.to_target[:2]) < 0.13
     placed = view.distance < 0.012 and abs(view.object[2] - top) < 0.008
-    if placed and math.hypot(dx, dy) < 0.04:
-        rise = _STEP if view.width > 0.055 else 0.0
-        return _action(0.0, 0.0, rise, _OPEN)
-    if around and view.width < 0.045:
+    if placed and view.reach < 0.04:
+        return _leave(view)
+    if _holds(view):
         if view.distance < 0.01:
-            return _action(way_x, way_y, min(0.0, max(-0.02, top - view.object[2])), _CLOSE)
+            return _action(way_x, way_y, min(0.0, max(-0.025, top - view.object[2])), _CLOSE)
         free = top + 0.04
-        if height < (free - 0.01 if near_tower else min(free, 0.08)):
-            return _action(0.0, 0.0, free - height, _CLOSE)
-        return _action(way_x, way_y, free - height, _CLOSE)
-    if around:
+        if height < (free - 0.01 if near_tower else min(free, 0.07)):
+            return _action(0.0, 0.0, free + 0.02 - height, _CLOSE)
+        return _action(way_x, way_y, free + 0.01 - height, _CLOSE)
+    if view.reach > 0.03 and height < (top + 0.02 if near_tower else 0.07):
+        return _leave(view)
+    return _approach(view, _CLEAR)
+
+
+def _holds(view: _View) -> bool:
+    """Return whether the block is between the closed fingers."""
+    return view.reach < 0.018 and abs(view.to_object[2]) < 0.018 and view.width < 0.045
+
+
+def _leave(view: _View) -> Action:
+    """Open the fingers, then rise."""
+    return _action(0.0, 0.0, _STEP if view.width > 0.055 else 0.0, _OPEN)
+
+
+def _approach(view: _View, clear: float) -> Action:
+    """Go over the object at height ``clear``, then down with open fingers, then close them."""
+    dx, dy, dz = view.to_object
+    if view.reach < 0.012 and abs(dz) < 0.012:
         return _action(dx, dy, dz, _CLOSE)
-    if view.reach < 0.012:
+    if view.reach < 0.012 or (view.reach < 0.02 and abs(dz) < 0.05):
         return _action(dx, dy, dz, _OPEN)
-    if near_tower and height < top + 0.02:
-        return _action(0.0, 0.0, _STEP, _OPEN)
-    if height < 0.07:
-        return _action(0.0, 0.0, _STEP, _OPEN)
-    return _action(dx, dy, _CLEAR - height, _OPEN)
+    return _action(dx, dy, clear - view.gripper[2], _OPEN)
 
 
 #: The controller of each environment id.
