@@ -81,8 +81,8 @@ def slide(observation: Observation) -> Action:
     down = 0.012 - height
     fingers = (0.04 - view.width) / 0.2
     outside = math.hypot(view.gripper[0] + 0.6, view.gripper[1]) > 0.69
-    if height < 0.03 and 0.0 < dx < 0.08 and abs(dy) < 0.02 and not outside:
-        speed = min(0.045, 0.25 * (0.12 - dx))
+    if height < 0.03 and 0.0 < dx < 0.08 and abs(dy) < 0.025 and not outside:
+        speed = 0.045
         return _action(speed * view.line[0], speed * view.line[1], down, fingers)
     if outside and height < 0.07 or math.hypot(*view.object_velocity[:2]) > 0.05:
         return _action(0.0, 0.0, _CLEAR - height, fingers)
