@@ -62,12 +62,25 @@ class PandaRobot:
             pybullet.changeDynamics(
                 self.body, finger, lateralFriction=1.0, spinningFriction=0.001, physicsClientId=client
             )
+        self._couple_fingers()
         self._gains = [motor_gain(time_step)] * len(_JOINTS)
         self._neutral = np.array(_NEUTRAL[: len(_ARM)])
         self.position = self.velocity = (0.0, 0.0, 0.0)
         self.width = 0.0
         self.place()
         self.read()
+
+    def _couple_fingers(self) -> None:
+        """Make the fingers move symmetrically, as those of the real hand do; PyBullet leaves out the URDF's mimic."""
+        gear = pybullet.createConstraint(
+            *(self.body, _FINGERS[0], self.body, _FINGERS[1]),
+            jointType=pybullet.JOINT_GEAR,
+            jointAxis=[1, 0, 0],
+            parentFramePosition=[0, 0, 0],
+            childFramePosition=[0, 0, 0],
+            physicsClientId=self.client,
+        )
+        pybullet.changeConstraint(gear, gearRatio=-1, erp=0.1, maxForce=100, physicsClientId=self.client)
 
     def place(self) -> None:
         """Put all joints into the neutral pose, at rest, fingers closed."""

@@ -234,7 +234,7 @@ class Scene:
         if levels != self._levels:
             self._levels = levels
             pybullet.setPhysicsEngineParameter(
-                numSolverIterations=levels * self.physics.solver_iterations, physicsClientId=self.client
+                numSolverIterations=(6 if levels > 1 else 1) * self.physics.solver_iterations, physicsClientId=self.client
             )
 
     def read(self) -> None:

@@ -163,11 +163,11 @@ class Slide(Task):
         """Return pucks near the robot and targets out of its reach, the ways in colour order free."""
 
         def propose(number: int) -> tuple[Points, Points]:
-            starts = rng.uniform((-0.32, -0.28), (0, 0.28), (number, 2))
+            starts = rng.uniform((-0.28, -0.28), (0.02, 0.28), (number, 2))
             return starts, starts
 
         def accept(starts: Points, _: Points, before: Points, __: Points) -> NDArray[np.bool_]:
-            return reachable(starts) & (distances(starts / self.separation, before / self.separation) > 1)
+            return reachable(starts, 0.34, 0.64) & (distances(starts / self.separation, before / self.separation) > 1)
 
         while True:
             starts = sample_in_order(n_objects, propose, accept)[0]

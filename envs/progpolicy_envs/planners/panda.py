@@ -81,10 +81,12 @@ def slide(observation: Observation) -> Action:
     down = 0.012 - height
     fingers = (0.04 - view.width) / 0.2
     outside = math.hypot(view.gripper[0] + 0.6, view.gripper[1]) > 0.69
-    if height < 0.03 and 0.0 < dx < 0.08 and abs(dy) < 0.025 and not outside:
-        speed = 0.045
-        return _action(speed * view.line[0], speed * view.line[1], down, fingers)
-    if outside and height < 0.07 or math.hypot(*view.object_velocity[:2]) > 0.05:
+    moving = math.hypot(*view.object_velocity[:2]) > 0.05
+    if height < 0.03 and 0.0 < dx < 0.08 and abs(dy) < 0.03 and not outside:
+        if not moving:
+            return _action(0.015, dy, down, fingers)
+        return _action(0.045 * view.line[0], 0.045 * view.line[1] + 0.3 * dy, down, fingers)
+    if moving or (outside and height < 0.07):
         return _action(0.0, 0.0, _CLEAR - height, fingers)
     if abs(dx - 0.06) < 0.012 and abs(dy) < 0.008:
         return _action(dx - 0.06, dy, down, fingers)
