@@ -111,8 +111,8 @@ def stack(observation: Observation) -> Action:
     if _holds(view):
         if view.distance < 0.01:
             return _action(way_x, way_y, min(0.0, max(-0.025, top - view.object[2])), _CLOSE)
-        free = top + 0.04
-        if height < (free - 0.01 if near_tower else min(free, 0.07)):
+        free = max(top + 0.04, _CLEAR)
+        if height < (free - 0.01 if near_tower else 0.09):
             return _action(0.0, 0.0, free + 0.02 - height, _CLOSE)
         return _action(way_x, way_y, free + 0.01 - height, _CLOSE)
     if view.reach > 0.03 and height < (top + 0.02 if near_tower else 0.07):
@@ -122,12 +122,12 @@ def stack(observation: Observation) -> Action:
 
 def _holds(view: _View) -> bool:
     """Return whether the block is between the closed fingers."""
-    return view.reach < 0.018 and abs(view.to_object[2]) < 0.018 and view.width < 0.045
+    return view.reach < 0.018 and abs(view.to_object[2]) < 0.018 and view.width < 0.058
 
 
 def _leave(view: _View) -> Action:
     """Open the fingers, then rise."""
-    return _action(0.0, 0.0, _STEP if view.width > 0.055 else 0.0, _OPEN)
+    return _action(0.0, 0.0, _STEP if view.width > 0.06 else 0.0, _OPEN)
 
 
 def _approach(view: _View, clear: float) -> Action:
