@@ -104,7 +104,8 @@ def stack(observation: Observation) -> Action:
     view = _View(observation)
     height, top = view.gripper[2], view.target[2]
     way_x, way_y = view.target[0] - view.object[0], view.target[1] - view.object[1]
-    near_tower = math.hypot(*view.to_target[:2]) < 0.13
+    # The hand is 20 cm wide along y and must not meet the tower either.
+    near_tower = abs(view.to_target[0]) < 0.1 and abs(view.to_target[1]) < 0.18
     placed = view.distance < 0.012 and abs(view.object[2] - top) < 0.008
     if placed and view.reach < 0.04:
         return _leave(view)
@@ -115,9 +116,10 @@ def stack(observation: Observation) -> Action:
         if height < (free - 0.01 if near_tower else 0.09):
             return _action(0.0, 0.0, free + 0.02 - height, _CLOSE)
         return _action(way_x, way_y, free + 0.01 - height, _CLOSE)
-    if view.reach > 0.03 and height < (top + 0.02 if near_tower else 0.07):
+    clear = max(top + 0.04, _CLEAR) if near_tower else _CLEAR
+    if view.reach > 0.03 and height < (top + 0.01 if near_tower else 0.07):
         return _leave(view)
-    return _approach(view, _CLEAR)
+    return _approach(view, clear)
 
 
 def _holds(view: _View) -> bool:
