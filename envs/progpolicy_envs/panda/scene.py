@@ -144,7 +144,7 @@ class Scene:
         half = [(table.high_x - table.low_x) / 2, table.width / 2, TABLE_HEIGHT / 2]
         look = {"halfExtents": half, "rgbaColor": [0.93, 0.92, 0.9, 1], "specularColor": [0, 0, 0]}
         client = self.client
-        pybullet.createMultiBody(
+        body = pybullet.createMultiBody(
             baseCollisionShapeIndex=pybullet.createCollisionShape(
                 pybullet.GEOM_BOX, halfExtents=half, physicsClientId=client
             ),
@@ -154,6 +154,10 @@ class Scene:
             basePosition=[(table.low_x + table.high_x) / 2, 0, -TABLE_HEIGHT / 2],
             physicsClientId=client,
         )
+        if self.physics.sleeping:
+            # Contacts are computed anew in every step unless both bodies sleep.
+            self._activate(body, pybullet.ACTIVATION_STATE_ENABLE_SLEEPING)
+            self._activate(body, pybullet.ACTIVATION_STATE_SLEEP)
 
     def _build_object(self, visual: bool) -> int:
         assert self.kind is not None
