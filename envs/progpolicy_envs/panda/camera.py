@@ -31,7 +31,7 @@ def _pale(colour: tuple[float, float, float]) -> list[float]:
 
 
 class Camera:
-    """Draws the scene, the targets in their objects' colours, and a black pin over the object in focus.
+    """Draws the scene, the targets in their objects' colours, and black pins over the object in focus and its target.
 
     What it adds to the world can be seen but not touched.
 
@@ -45,8 +45,7 @@ class Camera:
         for body, colour in zip(scene.objects, COLOURS, strict=False):
             pybullet.changeVisualShape(body, -1, rgbaColor=[*colour, 1], physicsClientId=scene.client)
         self._targets = [self._target(colour) for colour in COLOURS]
-        self._pin = self._ghost(pybullet.GEOM_SPHERE, [*MARKER_COLOUR, 1.0], radius=0.012)
-        self._needle = self._ghost(pybullet.GEOM_CYLINDER, [*MARKER_COLOUR, 1.0], radius=0.003, length=0.06)
+        self._pins = [self._pin() for _ in range(1 if isinstance(task, Reach) else 2)]
         self._floor = self._ghost(pybullet.GEOM_BOX, [0.55, 0.6, 0.64, 1.0], halfExtents=[3, 3, 0.01])
         self._put(self._floor, (0.0, 0.0, -0.42))
 
@@ -59,12 +58,15 @@ class Camera:
         for index, ghost in enumerate(self._targets[:MAX_OBJECTS]):
             shown = index < len(task.targets) and not (isinstance(task, Reach) and task.finished[index])
             self._put(ghost, self._target_position(index) if shown else _AWAY)
-        x, y, z = (task.targets if isinstance(task, Reach) else task.positions)[focus]
-        self._put(self._pin, (x, y, z + 0.1))
-        self._put(self._needle, (x, y, z + 0.065))
+        marked = [self._target_position(focus)]
+        if not isinstance(task, Reach):
+            marked.append(task.positions[focus])
+        for (head, needle), (x, y, z) in zip(self._pins, marked, strict=True):
+            self._put(head, (x, y, z + 0.085))
+            self._put(needle, (x, y, z + 0.05))
         middle = (self.scene.table.low_x + self.scene.table.high_x) / 2
-        view = pybullet.computeViewMatrixFromYawPitchRoll((middle + 0.12, 0, 0.05), 1.25, 55, -38, 0, 2)
-        projection = pybullet.computeProjectionMatrixFOV(48, WIDTH / HEIGHT, 0.1, 10)
+        view = pybullet.computeViewMatrixFromYawPitchRoll((middle + 0.05, 0, 0.2), 1.6, 60, -33, 0, 2)
+        projection = pybullet.computeProjectionMatrixFOV(42, WIDTH / HEIGHT, 0.1, 10)
         pixels = pybullet.getCameraImage(
             WIDTH,
             HEIGHT,
@@ -77,18 +79,22 @@ class Camera:
         )[2]
         return np.asarray(pixels, dtype=np.uint8).reshape(HEIGHT, WIDTH, 4)[:, :, :3].copy()
 
+    def _pin(self) -> tuple[int, int]:
+        head = self._ghost(pybullet.GEOM_SPHERE, [*MARKER_COLOUR, 1.0], radius=0.012)
+        return head, self._ghost(pybullet.GEOM_CYLINDER, [*MARKER_COLOUR, 1.0], radius=0.0035, length=0.06)
+
     def _target(self, colour: tuple[float, float, float]) -> int:
         if isinstance(self.task, Reach):
             return self._ghost(pybullet.GEOM_SPHERE, [*colour, 1.0], radius=0.02)
         if isinstance(self.task, Stack):
-            return self._ghost(pybullet.GEOM_BOX, _pale(colour), halfExtents=[0.012, 0.012, 0.012])
+            return self._ghost(pybullet.GEOM_BOX, [*colour, 1.0], halfExtents=[0.01, 0.01, 0.01])
         return self._ghost(pybullet.GEOM_CYLINDER, _pale(colour), radius=self.task.tolerance, length=0.002)
 
     def _target_position(self, index: int) -> tuple[float, float, float]:
         x, y, z = self.task.targets[index]
         if isinstance(self.task, Stack):
             # The pattern for the tower stands beside it, where the gripper does not hide it.
-            return x + 0.1, y, 0.012 + 0.024 * index
+            return x + 0.12, y, 0.01 + 0.02 * index
         return (x, y, z) if isinstance(self.task, Reach) else (x, y, 0.001)
 
     def _ghost(self, geometry: int, colour: list[float], **size: float | list[float]) -> int:

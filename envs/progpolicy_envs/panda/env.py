@@ -43,7 +43,7 @@ def _box(size: int) -> spaces.Box:
     return spaces.Box(-BOUND, BOUND, (size,), np.float32)
 
 
-class PandaEnv(gym.Env[Observation, NDArray[np.float32]]):
+class PandaEnv(gym.Env[Any, NDArray[np.float32]]):
     """What the Panda environments have in common; see :class:`~progpolicy_envs.panda.PandaPushEnv` and the others.
 
     A subclass names its :attr:`task_class` and its one variation parameter.
@@ -61,7 +61,7 @@ class PandaEnv(gym.Env[Observation, NDArray[np.float32]]):
         Two classes because SB3 takes whatever has a ``compute_reward`` for a goal environment.
         """
         if kwargs.get("observation") == "goal" and not issubclass(cls, GoalForm):
-            cls = _goal_form(cls)
+            cls = _goal_form(cls)  # type: ignore[arg-type]
         return super().__new__(cls)
 
     def __init__(
@@ -88,7 +88,9 @@ class PandaEnv(gym.Env[Observation, NDArray[np.float32]]):
                 desired_goal=_box(len(DESIRED_NAMES)),
             )
         )
-        self.observation_space = goal_space if observation == "goal" else _box(len(OBSERVATION_NAMES))
+        self.observation_space: spaces.Space[Any] = (
+            goal_space if observation == "goal" else _box(len(OBSERVATION_NAMES))
+        )
         self.task = self.task_class()
         self.scene = Scene(self.task.table, self.task.kind, physics, visual=render_mode is not None)
         self._camera = Camera(self.scene, self.task) if render_mode is not None else None
@@ -140,16 +142,16 @@ class PandaEnv(gym.Env[Observation, NDArray[np.float32]]):
             target = task.targets[index]
             shaping += PROGRESS * (math.dist(achieved, target) - math.dist(task.positions[index], target))
             achieved = self._achieved
+        success, failure = self._n_left == 0, task.failed
         info = {
-            "is_success": self._n_left == 0,
-            "is_failure": task.failed,
+            "is_success": success,
+            "is_failure": failure,
             "settled": task.settled(self.scene, self._focus),
             "previous_achieved_goal": achieved,
             "shaping": shaping,
         }
         self._show()
-        terminated = info["is_success"] or info["is_failure"]
-        return self._observe(), self._reward(info), terminated, False, info
+        return self._observe(), self._reward(info), success or failure, False, info
 
     def render(self) -> Any:
         """Return a picture ``(360, 480, 3)`` of bytes, or show a window, as ``render_mode`` says."""

@@ -33,9 +33,7 @@ ACTION_NAMES = ("move_x", "move_y", "move_z", "open")
 BOUND = 10.0
 
 
-def focus_observation(
-    robot: PandaRobot, state: ObjectState, target: Point, n_left: int
-) -> NDArray[np.float32]:
+def focus_observation(robot: PandaRobot, state: ObjectState, target: Point, n_left: int) -> NDArray[np.float32]:
     """Return the 32 numbers of the observation, in the order of :data:`OBSERVATION_NAMES`.
 
     :param robot: the robot

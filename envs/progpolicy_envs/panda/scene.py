@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import pybullet
 import pybullet_data
+
 from progpolicy_envs.panda.robot import PandaRobot
 
 MAX_OBJECTS = 8
@@ -164,10 +165,12 @@ class Scene:
         client, kind = self.client, self.kind
         radius, height = kind.half_extents[0], 2 * kind.half_extents[2]
         if kind.shape == "box":
-            geometry, size, looks = pybullet.GEOM_BOX, {"halfExtents": kind.half_extents}, {}
+            geometry = pybullet.GEOM_BOX
+            size: dict[str, Any] = {"halfExtents": kind.half_extents}
             looks = size
         else:
-            geometry, size = pybullet.GEOM_CYLINDER, {"radius": radius, "height": height}
+            geometry = pybullet.GEOM_CYLINDER
+            size = {"radius": radius, "height": height}
             looks = {"radius": radius, "length": height}
         body: int = pybullet.createMultiBody(
             baseMass=kind.mass,
@@ -238,7 +241,8 @@ class Scene:
         if levels != self._levels:
             self._levels = levels
             pybullet.setPhysicsEngineParameter(
-                numSolverIterations=(6 if levels > 1 else 1) * self.physics.solver_iterations, physicsClientId=self.client
+                numSolverIterations=(6 if levels > 1 else 1) * self.physics.solver_iterations,
+                physicsClientId=self.client,
             )
 
     def read(self) -> None:
@@ -251,7 +255,8 @@ class Scene:
     def object_state(self, index: int) -> ObjectState:
         """Return the full state of one object."""
         velocity, spin = pybullet.getBaseVelocity(self.objects[index], self.client)
-        return ObjectState(*self._poses[index], velocity, spin)
+        position, orientation = self._poses[index]
+        return ObjectState(position, orientation, velocity, spin)
 
     def close(self) -> None:
         """Disconnect from PyBullet; a second call does nothing."""
