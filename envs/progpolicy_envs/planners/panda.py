@@ -47,7 +47,8 @@ def reach(observation: Observation) -> Action:
     :param observation: ``(32,)``
     :return: ``(4,)``
     """
-    return _action(*_View(observation).to_target, _CLOSE)
+    x, y, z = _View(observation).to_target
+    return _action(x, y, z, _CLOSE)
 
 
 def push(observation: Observation) -> Action:
