@@ -9,10 +9,14 @@ from progpolicy_envs.domains import DOMAINS, HIKING_EGOCENTRIC, Domain, get_doma
 
 MAX_EPISODE_STEPS = 500
 
-_ENTRY_POINTS = {
+_ENTRY_POINTS: dict[str, tuple[str, str | None]] = {
     "Hanoi-v0": ("progpolicy_envs.hanoi:HanoiEnv", "progpolicy_envs.hanoi:HanoiVectorEnv"),
     "Hiking-v0": ("progpolicy_envs.hiking:HikingEnv", "progpolicy_envs.hiking:HikingVectorEnv"),
     "Stacking-v0": ("progpolicy_envs.stacking:StackingEnv", "progpolicy_envs.stacking:StackingVectorEnv"),
+    "PandaReach-v0": ("progpolicy_envs.panda:PandaReachEnv", None),
+    "PandaPush-v0": ("progpolicy_envs.panda:PandaPushEnv", None),
+    "PandaSlide-v0": ("progpolicy_envs.panda:PandaSlideEnv", None),
+    "PandaStack-v0": ("progpolicy_envs.panda:PandaStackEnv", None),
 }
 
 

@@ -20,6 +20,7 @@ class Domain:
     :param train: the variations to train on, the easiest first
     :param unseen: the variations to test generalisation on
     :param arguments: constructor arguments that hold for all of them
+    :param simulation: whether its steps are physics, so costly that several processes are worth having
     """
 
     id: str
@@ -27,6 +28,7 @@ class Domain:
     train: tuple[Variation, ...]
     unseen: tuple[Variation, ...]
     arguments: Mapping[str, Any] = field(default_factory=dict)
+    simulation: bool = False
 
 
 DOMAINS: dict[str, Domain] = {
@@ -49,6 +51,21 @@ DOMAINS: dict[str, Domain] = {
             size="n_plates",
             train=tuple({"n_plates": n_plates} for n_plates in (1, 2, 3, 4)),
             unseen=tuple({"n_plates": n_plates} for n_plates in (5, 6, 7, 8)),
+        ),
+        *(
+            Domain(
+                id=env_id,
+                size=size,
+                train=tuple({size: number} for number in (1, 2, 3)),
+                unseen=tuple({size: number} for number in (4, 5, 6, 7, 8)),
+                simulation=True,
+            )
+            for env_id, size in (
+                ("PandaReach-v0", "n_targets"),
+                ("PandaPush-v0", "n_objects"),
+                ("PandaSlide-v0", "n_objects"),
+                ("PandaStack-v0", "n_objects"),
+            )
         ),
     )
 }

@@ -1,0 +1,111 @@
+"""Pictures of a Panda scene, drawn with PyBullet's software renderer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pybullet
+
+from progpolicy_envs.panda.scene import MAX_OBJECTS, Scene
+from progpolicy_envs.panda.tasks import Reach, Stack, Task
+from progpolicy_envs.rendering import Frame
+
+WIDTH, HEIGHT = 480, 360
+#: Colours in the order in which objects are to be finished.
+COLOURS = (
+    (0.84, 0.15, 0.16),
+    (0.12, 0.47, 0.71),
+    (0.17, 0.63, 0.17),
+    (1.0, 0.75, 0.0),
+    (0.58, 0.25, 0.75),
+    (1.0, 0.5, 0.05),
+    (0.1, 0.75, 0.8),
+    (0.9, 0.45, 0.75),
+)
+MARKER_COLOUR = (0.05, 0.05, 0.05)
+_AWAY = (0.0, 0.0, -50.0)
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+
+
+def _pale(colour: tuple[float, float, float]) -> list[float]:
+    return [0.45 * part + 0.55 for part in colour] + [1.0]
+
+
+class Camera:
+    """Draws the scene, the targets in their objects' colours, and black pins over the object in focus and its target.
+
+    What it adds to the world can be seen but not touched.
+
+    :param scene: a scene built with ``visual=True``
+    :param task: its task
+    """
+
+    def __init__(self, scene: Scene, task: Task) -> None:
+        self.scene = scene
+        self.task = task
+        for body, colour in zip(scene.objects, COLOURS, strict=False):
+            pybullet.changeVisualShape(body, -1, rgbaColor=[*colour, 1], physicsClientId=scene.client)
+        self._targets = [self._target(colour) for colour in COLOURS]
+        self._pins = [self._pin() for _ in range(1 if isinstance(task, Reach) else 2)]
+        self._floor = self._ghost(pybullet.GEOM_BOX, [0.55, 0.6, 0.64, 1.0], halfExtents=[3, 3, 0.01])
+        self._put(self._floor, (0.0, 0.0, -0.42))
+
+    def frame(self, focus: int) -> Frame:
+        """Return a picture ``(360, 480, 3)`` of bytes.
+
+        :param focus: index of the object in focus
+        """
+        task = self.task
+        for index, ghost in enumerate(self._targets[:MAX_OBJECTS]):
+            shown = index < len(task.targets) and not (isinstance(task, Reach) and task.finished[index])
+            self._put(ghost, self._target_position(index) if shown else _AWAY)
+        marked = [self._target_position(focus)]
+        if not isinstance(task, Reach):
+            marked.append(task.positions[focus])
+        for (head, needle), (x, y, z) in zip(self._pins, marked, strict=True):
+            self._put(head, (x, y, z + 0.085))
+            self._put(needle, (x, y, z + 0.05))
+        middle = (self.scene.table.low_x + self.scene.table.high_x) / 2
+        view = pybullet.computeViewMatrixFromYawPitchRoll((middle + 0.05, 0, 0.2), 1.6, 60, -33, 0, 2)
+        projection = pybullet.computeProjectionMatrixFOV(42, WIDTH / HEIGHT, 0.1, 10)
+        pixels = pybullet.getCameraImage(
+            WIDTH,
+            HEIGHT,
+            view,
+            projection,
+            lightDirection=[0.6, 0.9, 2.0],
+            shadow=1,
+            renderer=pybullet.ER_TINY_RENDERER,
+            physicsClientId=self.scene.client,
+        )[2]
+        return np.asarray(pixels, dtype=np.uint8).reshape(HEIGHT, WIDTH, 4)[:, :, :3].copy()
+
+    def _pin(self) -> tuple[int, int]:
+        head = self._ghost(pybullet.GEOM_SPHERE, [*MARKER_COLOUR, 1.0], radius=0.012)
+        return head, self._ghost(pybullet.GEOM_CYLINDER, [*MARKER_COLOUR, 1.0], radius=0.0035, length=0.06)
+
+    def _target(self, colour: tuple[float, float, float]) -> int:
+        if isinstance(self.task, Reach):
+            return self._ghost(pybullet.GEOM_SPHERE, [*colour, 1.0], radius=0.02)
+        if isinstance(self.task, Stack):
+            return self._ghost(pybullet.GEOM_BOX, [*colour, 1.0], halfExtents=[0.01, 0.01, 0.01])
+        return self._ghost(pybullet.GEOM_CYLINDER, _pale(colour), radius=self.task.tolerance, length=0.002)
+
+    def _target_position(self, index: int) -> tuple[float, float, float]:
+        x, y, z = self.task.targets[index]
+        if isinstance(self.task, Stack):
+            # The pattern for the tower stands beside it, where the gripper does not hide it.
+            return x + 0.12, y, 0.01 + 0.02 * index
+        return (x, y, z) if isinstance(self.task, Reach) else (x, y, 0.001)
+
+    def _ghost(self, geometry: int, colour: list[float], **size: float | list[float]) -> int:
+        client = self.scene.client
+        shape = pybullet.createVisualShape(
+            geometry, rgbaColor=colour, specularColor=[0, 0, 0], physicsClientId=client, **size
+        )
+        body: int = pybullet.createMultiBody(
+            baseMass=0, baseVisualShapeIndex=shape, basePosition=_AWAY, physicsClientId=client
+        )
+        return body
+
+    def _put(self, ghost: int, position: tuple[float, float, float]) -> None:
+        pybullet.resetBasePositionAndOrientation(ghost, position, _UPRIGHT, self.scene.client)

@@ -1,0 +1,283 @@
+"""The four tasks: where things start, when an object is finished, and from where the gripper works on it."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from progpolicy_envs.panda.placement import (
+    Points,
+    corridor_distances,
+    distances,
+    extended,
+    reachable,
+    sample_in_order,
+)
+from progpolicy_envs.panda.scene import FALL_DEPTH, ObjectKind, Point, Scene, Table
+
+
+class Task(ABC):
+    """One task and its state in the running episode.
+
+    A few numbers are read at every step, so they are plain floats rather than arrays: ``positions``, of what is to be
+    brought to the targets, ``targets`` and ``finished`` have one entry per object.
+    """
+
+    table: ClassVar[Table] = Table()
+    kind: ClassVar[ObjectKind | None] = None
+    #: Distance from the target within which an object counts as there, metres.
+    tolerance: ClassVar[float] = 0.05
+
+    def __init__(self) -> None:
+        self.positions: list[Point] = []
+        self.targets: list[Point] = []
+        self.finished: list[bool] = []
+
+    def reset(self, scene: Scene, rng: np.random.Generator, n_objects: int) -> None:
+        """Draw starts and targets and place the objects.
+
+        :param scene: the world
+        :param rng: the only source of chance
+        :param n_objects: how many objects, or targets of Reach
+        """
+        starts, targets = self.sample(rng, n_objects)
+        scene.place([tuple(start) for start in starts.tolist()])
+        self.targets = [tuple(target) for target in targets.tolist()]
+        self.finished = [False] * n_objects
+        self.positions = self._positions(scene)
+
+    def update(self, scene: Scene) -> None:
+        """Take over the state of the world after a control step."""
+        self.positions = self._positions(scene)
+        self.finished = [self._is_finished(scene, index) for index in range(len(self.targets))]
+
+    @property
+    def focus(self) -> int:
+        """Index of the first unfinished object in colour order; the last one when all are finished."""
+        return self.finished.index(False) if not all(self.finished) else len(self.finished) - 1
+
+    @property
+    def failed(self) -> bool:
+        """Whether an object has left the table."""
+        return any(position[2] < -FALL_DEPTH for position in self.positions)
+
+    def settled(self, scene: Scene, index: int) -> bool:
+        """Return whether an object, if it is at its target, is finished as far as all else is concerned."""
+        return True
+
+    @abstractmethod
+    def sample(self, rng: np.random.Generator, n_objects: int) -> tuple[Points, Points]:
+        """Return starts (``(n, 3)``; ``(0, 3)`` for Reach) and targets ``(n, 3)``."""
+
+    @abstractmethod
+    def handle(self, index: int) -> Point | None:
+        """Return the point from which the gripper works on an object; ``None`` where there is none."""
+
+    def _positions(self, scene: Scene) -> list[Point]:
+        return scene.positions
+
+    def _is_finished(self, scene: Scene, index: int) -> bool:
+        return math.dist(self.positions[index], self.targets[index]) < self.tolerance
+
+
+class Reach(Task):
+    """The gripper visits the targets in order."""
+
+    separation = 0.1
+
+    def sample(self, rng: np.random.Generator, n_objects: int) -> tuple[Points, Points]:
+        """Return no starts and targets in the air, apart from each other and from the gripper's start."""
+        gripper = np.array([[0.04, 0.0, 0.2]])
+
+        def propose(number: int) -> tuple[Points, Points]:
+            targets = rng.uniform((-0.2, -0.25, 0.05), (0.13, 0.25, 0.35), (number, 3))
+            return targets, targets
+
+        def accept(starts: Points, targets: Points, _: Points, before: Points) -> NDArray[np.bool_]:
+            return distances(targets, np.concatenate((gripper, before))) > self.separation
+
+        return np.zeros((0, 3)), sample_in_order(n_objects, propose, accept)[1]
+
+    def handle(self, index: int) -> Point | None:
+        """Return ``None``: the gripper itself is what moves."""
+        return None
+
+    def _positions(self, scene: Scene) -> list[Point]:
+        return [scene.robot.position] * len(self.targets)
+
+    def _is_finished(self, scene: Scene, index: int) -> bool:
+        # The list is being rebuilt in order, so a target counts only once those before it have been visited.
+        return self.finished[index] or (index == self.focus and super()._is_finished(scene, index))
+
+
+class Push(Task):
+    """Every block lies within 5 cm of its target, all at once."""
+
+    kind = ObjectKind("box", (0.02, 0.02, 0.02), mass=1.0, friction=0.5)
+    separation, clearance = 0.09, 0.08
+    run_up = 0.08
+
+    def sample(self, rng: np.random.Generator, n_objects: int) -> tuple[Points, Points]:
+        """Return blocks and targets so that each block in colour order can be pushed straight to its target."""
+
+        def propose(number: int) -> tuple[Points, Points]:
+            points = rng.uniform((-0.3, -0.27), (0.1, 0.27), (2, number, 2))
+            return points[0], points[1]
+
+        def accept(starts: Points, targets: Points, before: Points, done: Points) -> NDArray[np.bool_]:
+            behind = extended(starts, targets, self.run_up)
+            length = np.linalg.norm(targets - starts, axis=1)
+            fits = (length > 0.1) & (length < 0.35) & reachable(behind) & reachable(starts) & reachable(targets)
+            fits &= (distances(starts, before) > self.separation) & (distances(targets, done) > self.separation)
+            if len(before):
+                # While this block is pushed the earlier ones lie on their targets, and the other way round.
+                fits &= (corridor_distances(behind, targets, done) > self.clearance).all(axis=1)
+                ways = corridor_distances(extended(before, done, self.run_up), done, starts)
+                fits &= (ways > self.clearance).all(axis=0)
+            return fits
+
+        return _on_table(*sample_in_order(n_objects, propose, accept), height=self.kind.height)
+
+    def handle(self, index: int) -> Point:
+        """Return the point behind the block on the line to its target."""
+        return _behind(self.positions[index], self.targets[index], 0.05)
+
+
+class Slide(Task):
+    """Every puck has been inside its target disc, beyond the arm's reach; it is then taken off the table."""
+
+    table = Table(low_x=-0.8, high_x=0.6)
+    kind = ObjectKind("cylinder", (0.03, 0.03, 0.015), mass=1.0, friction=0.04)
+    clearance = 0.08
+    run_up = 0.06
+    #: Half axes of the ellipse around a puck in which no other starts; longer along x, the way to the targets.
+    separation = np.array([0.14, 0.1])
+    #: Tangent of the largest angle between the x axis and the way to the target.
+    slope = 0.4
+
+    def sample(self, rng: np.random.Generator, n_objects: int) -> tuple[Points, Points]:
+        """Return pucks near the robot and targets out of its reach, the ways in colour order free."""
+
+        def propose(number: int) -> tuple[Points, Points]:
+            starts = rng.uniform((-0.28, -0.28), (0.02, 0.28), (number, 2))
+            return starts, starts
+
+        def accept(starts: Points, _: Points, before: Points, __: Points) -> NDArray[np.bool_]:
+            return reachable(starts, 0.34, 0.64) & (distances(starts / self.separation, before / self.separation) > 1)
+
+        while True:
+            starts = sample_in_order(n_objects, propose, accept)[0]
+            # The front pucks come first, so that they do not bar the way of those behind them.
+            starts = starts[np.argsort(-starts[:, 0])]
+            targets = self._sample_targets(rng, starts)
+            if len(targets) == n_objects:
+                return _on_table(starts, targets, height=self.kind.height)
+
+    def _sample_targets(self, rng: np.random.Generator, starts: Points) -> Points:
+        """Return targets ``(m, 2)`` for the first m pucks; fewer than there are pucks where one finds no place."""
+        targets = np.zeros((0, 2))
+        for index, start in enumerate(starts):
+            candidates = rng.uniform((0.3, -0.29), (0.54, 0.29), (128, 2))
+            ways = candidates - start
+            run_up = extended(start, candidates, self.run_up)
+            fits = np.abs(ways[:, 1]) < self.slope * ways[:, 0]
+            fits &= distances(candidates, targets) > 2 * self.tolerance
+            fits &= (corridor_distances(run_up, candidates, starts[index + 1 :]) > self.clearance).all(axis=1)
+            if not fits.any():
+                break
+            targets = np.concatenate((targets, candidates[fits][:1]))
+        return targets
+
+    def update(self, scene: Scene) -> None:
+        """Take over the state of the world and take delivered pucks off the table."""
+        before = self.finished
+        super().update(scene)
+        for index, (old, new) in enumerate(zip(before, self.finished, strict=True)):
+            if new and not old:
+                scene.park(index)
+
+    def handle(self, index: int) -> Point:
+        """Return the point behind the puck on the line to its target."""
+        return _behind(self.positions[index], self.targets[index], 0.06)
+
+    def _positions(self, scene: Scene) -> list[Point]:
+        # A delivered puck keeps the place where it was delivered, although it is off the table.
+        if not any(self.finished):
+            return scene.positions
+        places = zip(self.finished, self.positions, scene.positions, strict=True)
+        return [old if finished else new for finished, old, new in places]
+
+    def _is_finished(self, scene: Scene, index: int) -> bool:
+        return self.finished[index] or super()._is_finished(scene, index)
+
+
+class Stack(Task):
+    """The blocks stand on each other in colour order at the tower's place, at rest, the gripper away from them."""
+
+    kind = ObjectKind("box", (0.02, 0.02, 0.02), mass=1.0, friction=0.5)
+    tolerance = 0.03
+    #: A block that moves less than this in one control step is at rest, metres.
+    rest_motion = 0.001
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._before: list[Point] = []
+
+    def sample(self, rng: np.random.Generator, n_objects: int) -> tuple[Points, Points]:
+        """Return blocks that the open gripper can pick up and their places in a tower beside them."""
+        foot = rng.uniform((-0.02, -0.12), (0.08, 0.12))
+
+        def propose(number: int) -> tuple[Points, Points]:
+            starts = rng.uniform((-0.32, -0.28), (0.08, 0.28), (number, 2))
+            return starts, np.broadcast_to(foot, starts.shape)
+
+        def accept(starts: Points, targets: Points, before: Points, _: Points) -> NDArray[np.bool_]:
+            x, y = (starts - targets).T
+            # The wrist behind the gripper must not meet the tower, nor the hand, which is 20 cm wide.
+            fits = ((x < -0.1) | (np.abs(y) > 0.2)) & reachable(starts)
+            apart = np.abs(starts[:, None] - before[None])
+            return fits & ((apart[..., 0] > 0.07) | (apart[..., 1] > 0.11)).all(axis=1)
+
+        starts, targets = _on_table(*sample_in_order(n_objects, propose, accept), height=self.kind.height)
+        targets[:, 2] += 2 * self.kind.height * np.arange(n_objects)
+        return starts, targets
+
+    def reset(self, scene: Scene, rng: np.random.Generator, n_objects: int) -> None:
+        """Draw starts and the tower's place and place the blocks."""
+        super().reset(scene, rng, n_objects)
+        self._before = self.positions
+
+    def update(self, scene: Scene) -> None:
+        """Take over the state of the world after a control step."""
+        self._before = self.positions
+        super().update(scene)
+
+    def handle(self, index: int) -> Point:
+        """Return the block's own position."""
+        return self.positions[index]
+
+    def settled(self, scene: Scene, index: int) -> bool:
+        """Return whether the block is at rest and free of the gripper: fingertips above it, or beside it."""
+        x, y, z = self.positions[index]
+        gripper_x, gripper_y, gripper_z = scene.robot.position
+        free = gripper_z - z > 0.03 or math.hypot(gripper_x - x, gripper_y - y) > 0.06
+        return free and math.dist(self.positions[index], self._before[index]) < self.rest_motion
+
+    def _is_finished(self, scene: Scene, index: int) -> bool:
+        return super()._is_finished(scene, index) and self.settled(scene, index)
+
+
+def _on_table(starts: Points, targets: Points, height: float) -> tuple[Points, Points]:
+    heights = np.full((len(starts), 1), height)
+    return np.hstack((starts, heights)), np.hstack((targets, heights))
+
+
+def _behind(position: Point, target: Point, back: float) -> Point:
+    x, y, z = position
+    way_x, way_y = target[0] - x, target[1] - y
+    share = back / max(math.hypot(way_x, way_y), 1e-6)
+    return x - share * way_x, y - share * way_y, z
