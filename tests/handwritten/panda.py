@@ -1,6 +1,10 @@
 """Hand-written programs for the Panda tasks: they show that the focus observation lets short programs solve them.
 
 Every condition is affine and every controller is affine, in the observation alone; nothing is remembered.
+
+Measured on seeds 0-5: Reach and Push solve 6 of 6 with one and with eight objects, Stack 6 of 6 with one block but none
+with eight (its first condition takes a block that lies below its place for one that has been put there), Slide 4 of
+6 with one puck and 3 of 6 with three.
 """
 
 from __future__ import annotations
