@@ -36,7 +36,7 @@ def rollout(env, env_id: str, seed: int, size: int, steps: int = 80) -> np.ndarr
     trajectory = [np.append(observation, 0.0)]
     for _ in range(steps):
         # A bias downwards makes the gripper meet objects and the table.
-        action = np.clip(rng.uniform(-1, 1, 4) + [0, 0, -0.3, 0], -1, 1).astype(np.float32)
+        action = np.clip(rng.uniform((-1, -1, -1.3, -1), (1, 1, 0.7, 1)), -1, 1).astype(np.float32)
         observation, reward, terminated, _, _ = env.step(action)
         trajectory.append(np.append(observation, reward))
         if terminated:
