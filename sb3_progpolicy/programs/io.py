@@ -1,4 +1,4 @@
-"""Programs as JSON files: no pickle, nothing evaluated, every float kept to the last bit."""
+"""Programs as JSON files: plain data, nothing evaluated, every float kept to the last bit."""
 
 from __future__ import annotations
 

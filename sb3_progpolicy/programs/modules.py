@@ -63,7 +63,7 @@ class Conditions(nn.Module):
         weight.register_hook(lambda gradient: gradient * mask.to(gradient.device))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a copied or pickled module; torch copies no hooks, so that the block structure is set anew."""
+        """Restore a copied module; torch copies no hooks, so that the block structure is set anew."""
         super().__setstate__(state)
         if self.recurrent:
             self._make_block_diagonal()
