@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from sb3_progpolicy.pretrained import load_pretrained, pretrained_names
     from sb3_progpolicy.reptile import ReptileWrapper
     from sb3_progpolicy.reptile_ppo import ReptilePPO
-    from sb3_progpolicy.tasks import TaskDistribution
+    from sb3_progpolicy.tasks import RemakeOnVariation, TaskDistribution
 
 # Modules are imported when a name is first used: reading and running a program needs no torch.
 _MODULES = {
@@ -21,6 +21,7 @@ _MODULES = {
     "InteractionHistory": "interaction",
     "ProgrammaticPolicy": "policies",
     "RecurrentProgrammaticPolicy": "policies",
+    "RemakeOnVariation": "tasks",
     "ReptileCheckpoint": "checkpoint",
     "ReptilePPO": "reptile_ppo",
     "ReptileWrapper": "reptile",
@@ -37,6 +38,7 @@ __all__ = [
     "InteractionHistory",
     "ProgrammaticPolicy",
     "RecurrentProgrammaticPolicy",
+    "RemakeOnVariation",
     "ReptileCheckpoint",
     "ReptilePPO",
     "ReptileWrapper",

@@ -184,6 +184,33 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
             return self.action_dist.proba_distribution(parameters, self.log_std)
         return self.action_dist.proba_distribution(action_logits=parameters)
 
+    def evaluate_derivation(
+        self, obs: th.Tensor, tests: th.Tensor, actions: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor | None]:
+        """Return log-probabilities and entropies for conditions whose values are known, as when only W is moved.
+
+        :param obs: ``(n, n_inputs)``
+        :param tests: the values of B, ``(n, depth - 1)``, from :meth:`condition_values`
+        :param actions: ``(n,)`` or ``(n, ...)``
+        """
+        distribution = self._distribution(self._split_features(obs)[0], tests)
+        return distribution.log_prob(actions), distribution.entropy()
+
+    def condition_values(self, obs: th.Tensor, states: tuple[th.Tensor, ...] | None = None) -> th.Tensor:
+        """Return the value of B of every condition, ``(n, depth - 1)``.
+
+        :param obs: ``(n, n_inputs)``; for recurrent conditions the steps of each sequence one after the other
+        :param states: of recurrent conditions at the start of the sequences
+        """
+        features, _ = self._split_features(obs)
+        return self._tests(features, states or self.module.initial_state(1), features.new_zeros(len(features)))[0]
+
+    def _tests(
+        self, features: th.Tensor, states: tuple[th.Tensor, ...], episode_starts: th.Tensor
+    ) -> tuple[th.Tensor, State]:
+        """Return the values of B and the new states; affine conditions have none."""
+        return self.module.conditions(features, cast(State, states))
+
     def _values(self, features: th.Tensor) -> th.Tensor:
         return self.value_net(self.mlp_extractor.forward_critic(features))
 
@@ -264,7 +291,8 @@ class RecurrentProgrammaticPolicy(ProgrammaticActorCritic, RecurrentActorCriticP
         pi_features, vf_features = self._split_features(obs)
         tests, _ = self._tests(pi_features, lstm_states.pi, episode_starts)
         distribution = self._distribution(pi_features, tests)
-        return self._values(vf_features), distribution.log_prob(actions), distribution.entropy()
+        # RecurrentPPO hands MultiBinary actions over as int8, which a Bernoulli distribution does not take.
+        return self._values(vf_features), distribution.log_prob(actions.float()), distribution.entropy()
 
 
 class ProgrammaticPolicy(ProgrammaticActorCritic):
@@ -281,8 +309,7 @@ class ProgrammaticPolicy(ProgrammaticActorCritic):
         super().__init__(*args, **kwargs)
 
     def _distribution_of(self, features: th.Tensor) -> Distribution:
-        tests, _ = self.module.conditions(features, self.module.initial_state(1))
-        return self._distribution(features, tests)
+        return self._distribution(features, self.module.conditions(features, self.module.initial_state(1))[0])
 
     def forward(self, obs: th.Tensor, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """Return actions, values and log-probabilities. See ``ActorCriticPolicy.forward``."""

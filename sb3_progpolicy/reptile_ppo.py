@@ -60,9 +60,9 @@ class ReptilePPO(PPO):
     * the policy also sees its previous action, reward and done flag, and recurrent states survive the end of an
       episode; they are zeroed at a task switch only (section 2.4);
     * recurrent policies train on whole rollouts, one unpadded sequence per environment;
-    * while the search goes on, gradient steps alternate between W, with phi frozen, and phi, with W frozen (section
-      2.3). When ``search_fraction`` of the steps is over the most likely program is extracted (line 10) and phi alone
-      is trained on (lines 11-17).
+    * while the search goes on, updates alternate between phi, with W frozen, and W, with phi frozen (section 2.3). When
+      ``search_fraction`` of the steps is over the most likely program is extracted (line 10) and phi alone is trained
+      on (lines 11-17).
 
     :param policy: ``"ProgPolicy"``, ``"PRLPolicy"``, ``"MlpPolicy"``, ``"MlpLstmPolicy"`` or a policy class
     :param env: an environment id (the fastest vectorised form is built), an environment or a ``VecEnv``
@@ -362,6 +362,7 @@ class ReptilePPO(PPO):
         if self._sampler is not None:
             rollout = self._sequences()
             values, log_probs, _ = self._evaluate(rollout)
+            assert values is not None
             shape = (-1, self.n_envs, self.sequence_length)
             for array, values_of in ((buffer.values, values), (buffer.log_probs, log_probs)):
                 array[:] = values_of.numpy().reshape(shape).swapaxes(1, 2).reshape(array.shape)
@@ -387,42 +388,53 @@ class ReptilePPO(PPO):
     # ------------------------------------------------------------------------------ line 7: estimate theta_hat
 
     def train(self) -> None:
-        """Make one PPO update from the rollout in the buffer."""
+        """Make one PPO update from the rollout in the buffer.
+
+        While the search goes on, every second update moves W with phi frozen and the others phi with W frozen (the
+        bilevel optimisation of section 2.3).
+        """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         clip_range = self.clip_range(self._current_progress_remaining)  # type: ignore[operator]
-        searching = self.search is not None and self.search.searching and len(self.search.logits)
+        searching = self.search is not None and self.search.searching and len(self.search.logits) > 0
+        moves_derivation = searching and (self._n_updates // self.n_epochs) % 2 == 1
+        self._freeze(derivation=searching and not moves_derivation, phi=moves_derivation)
         rollout = self._sequences()
-        statistics: list[th.Tensor] = []
-        # The count goes on from update to update, so that both have their turns where an update is a single step.
-        minibatches = self._minibatches(len(rollout["advantages"]))
-        for gradient_step, sequences in enumerate(minibatches, start=self._n_updates):
-            if searching:
-                self._freeze(derivation=gradient_step % 2 == 1)
+        if moves_derivation:
+            rollout["tests"] = self._condition_values(rollout)
+        statistics: list[dict[str, th.Tensor]] = []
+        for sequences in self._minibatches(len(rollout["advantages"])):
             loss, measured = self._loss(rollout, sequences, clip_range)
             statistics.append(measured)
-            if self.target_kl is not None and measured[3] > 1.5 * self.target_kl:
+            if self.target_kl is not None and measured["approx_kl"] > 1.5 * self.target_kl:
                 break
             self.policy.optimizer.zero_grad()
             loss.backward()
             th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
             self.policy.optimizer.step()
-        if searching:
-            self._freeze(derivation=None)
+        self._freeze(derivation=False, phi=False)
         self._n_updates += self.n_epochs
-        self._log(th.stack(statistics).mean(0).tolist(), clip_range)
+        self._log(statistics, clip_range)
         if isinstance(self.policy.features_extractor, NormalizingExtractor):
             self.policy.features_extractor.update(rollout["observations"].flatten(0, 1))
 
-    def _freeze(self, derivation: bool | None) -> None:
-        """Freeze W (``True``), phi (``False``) or nothing (``None``)."""
+    def _freeze(self, derivation: bool, phi: bool) -> None:
+        """Freeze W, or phi, or neither."""
+        if not isinstance(self.policy, ProgrammaticActorCritic):
+            return
+        self.policy.optimizer.zero_grad()
+        for parameter in self.policy.derivation_parameters():
+            parameter.requires_grad_(not derivation)
+        for parameter in self.policy.phi():
+            parameter.requires_grad_(not phi)
+
+    @th.no_grad()
+    def _condition_values(self, rollout: Mapping[str, th.Tensor]) -> th.Tensor:
+        """Return B at every step of the rollout: with phi frozen it stays the same throughout the update."""
         assert isinstance(self.policy, ProgrammaticActorCritic)
-        for parameters, frozen in (
-            (self.policy.derivation_parameters(), derivation is True),
-            (self.policy.phi(), derivation is False),
-        ):
-            for parameter in parameters:
-                parameter.requires_grad_(not frozen)
+        observations = rollout["observations"].flatten(0, 1)
+        states = self._states(rollout).pi if self.recurrent else None
+        return self.policy.condition_values(observations, states).unflatten(0, rollout["advantages"].shape)
 
     def _sequences(self) -> dict[str, th.Tensor]:
         """Lay the buffer out as ``(n_sequences, sequence_length, ...)``; nothing resets inside: nothing is padded."""
@@ -436,6 +448,8 @@ class ReptilePPO(PPO):
         rollout = {name: lay_out(getattr(buffer, name)) for name in names}
         if isinstance(self.action_space, (spaces.Discrete, spaces.MultiDiscrete)):
             rollout["actions"] = rollout["actions"].long()
+        elif isinstance(self.action_space, spaces.MultiBinary):
+            rollout["actions"] = rollout["actions"].float()
         if self.recurrent:
             for part in ("pi", "vf"):
                 for i, kind in enumerate("hc"):
@@ -449,51 +463,63 @@ class ReptilePPO(PPO):
             order = self.reptile.rng.permutation(n_sequences)
             yield from (order[start : start + per_batch] for start in range(0, n_sequences, per_batch))
 
-    def _evaluate(self, batch: Mapping[str, th.Tensor]) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+    @staticmethod
+    def _states(batch: Mapping[str, th.Tensor]) -> RNNStates:
+        """Return the states at which the sequences of a batch start."""
+        pi, vf = (tuple(batch[part + kind].transpose(0, 1).contiguous() for kind in "hc") for part in ("pi", "vf"))
+        return RNNStates(pi, vf)
+
+    def _evaluate(self, batch: Mapping[str, th.Tensor]) -> tuple[th.Tensor | None, th.Tensor, th.Tensor | None]:
+        """Return values (``None`` when only W is moved), log-probabilities and entropies of a batch of sequences."""
         observations, actions = (batch[name].flatten(0, 1) for name in ("observations", "actions"))
         if isinstance(self.action_space, spaces.Discrete):
             actions = actions.flatten()
+        if "tests" in batch:
+            policy = cast(ProgrammaticActorCritic, self.policy)
+            return None, *policy.evaluate_derivation(observations, batch["tests"].flatten(0, 1), actions)
         if not self.recurrent:
             return self.policy.evaluate_actions(observations, actions)
-        pi, vf = (tuple(batch[part + kind].transpose(0, 1).contiguous() for kind in "hc") for part in ("pi", "vf"))
         starts = th.zeros(len(observations), device=self.device)
-        return self.policy.evaluate_actions(observations, actions, RNNStates(pi, vf), starts)  # type: ignore[call-arg]
+        return self.policy.evaluate_actions(observations, actions, self._states(batch), starts)  # type: ignore[call-arg]
 
     def _loss(
         self, rollout: Mapping[str, th.Tensor], sequences: np.ndarray, clip_range: float
-    ) -> tuple[th.Tensor, th.Tensor]:
+    ) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """Return PPO's clipped loss (Schulman et al., 2017), with the price on length, and what is logged of it."""
         index = th.as_tensor(sequences, device=self.device)
         batch = {name: tensor[index] for name, tensor in rollout.items()}
         values, log_prob, entropy = self._evaluate(batch)
-        values = values.flatten()
-        old_log_prob, advantages, returns, old_values = (
-            batch[name].flatten() for name in ("log_probs", "advantages", "returns", "values")
-        )
+        advantages = batch["advantages"].flatten()
         if self.normalize_advantage and len(advantages) > 1:
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-        log_ratio = log_prob - old_log_prob
+        log_ratio = log_prob - batch["log_probs"].flatten()
         ratio = log_ratio.exp()
         clipped = ratio.clamp(1 - clip_range, 1 + clip_range)
         policy_loss = -th.min(advantages * ratio, advantages * clipped).mean()
-        if self.clip_range_vf is not None:
-            reach = self.clip_range_vf(self._current_progress_remaining)  # type: ignore[operator]
-            values = old_values + (values - old_values).clamp(-reach, reach)
-        value_loss = th.nn.functional.mse_loss(returns, values)
         entropy_loss = -(-log_prob if entropy is None else entropy).mean()
-        loss = policy_loss + self.ent_coef * entropy_loss + self.vf_coef * value_loss
+        loss = policy_loss + self.ent_coef * entropy_loss
+        measured = {"policy_gradient_loss": policy_loss, "entropy_loss": entropy_loss}
+        if values is not None:
+            measured["value_loss"] = self._value_loss(values.flatten(), batch)
+            loss = loss + self.vf_coef * measured["value_loss"]
         if self.length_coef and self.search is not None:
             loss = loss + self.length_coef * self.search.expected_conditions()
         with th.no_grad():
-            approx_kl = ((ratio - 1) - log_ratio).mean()
-            clip_fraction = ((ratio - 1).abs() > clip_range).float().mean()
-            measured = th.stack((policy_loss, value_loss, entropy_loss, approx_kl, clip_fraction, loss)).detach()
-        return loss, measured
+            measured["approx_kl"] = ((ratio - 1) - log_ratio).mean()
+            measured["clip_fraction"] = ((ratio - 1).abs() > clip_range).float().mean()
+        measured["loss"] = loss
+        return loss, {name: value.detach() for name, value in measured.items()}
 
-    def _log(self, statistics: Sequence[float], clip_range: float) -> None:
-        names = ("policy_gradient_loss", "value_loss", "entropy_loss", "approx_kl", "clip_fraction", "loss")
-        for name, value in zip(names, statistics, strict=True):
-            self.logger.record(f"train/{name}", value)
+    def _value_loss(self, values: th.Tensor, batch: Mapping[str, th.Tensor]) -> th.Tensor:
+        if self.clip_range_vf is not None:
+            reach = self.clip_range_vf(self._current_progress_remaining)  # type: ignore[operator]
+            old_values = batch["values"].flatten()
+            values = old_values + (values - old_values).clamp(-reach, reach)
+        return th.nn.functional.mse_loss(batch["returns"].flatten(), values)
+
+    def _log(self, statistics: Sequence[Mapping[str, th.Tensor]], clip_range: float) -> None:
+        for name in statistics[0]:
+            self.logger.record(f"train/{name}", th.stack([measured[name] for measured in statistics]).mean().item())
         values, returns = self.rollout_buffer.values.flatten(), self.rollout_buffer.returns.flatten()
         self.logger.record("train/explained_variance", explained_variance(values, returns))
         if hasattr(self.policy, "log_std"):
@@ -528,9 +554,9 @@ class ReptilePPO(PPO):
         if not isinstance(self.policy, ProgrammaticActorCritic):
             raise TypeError(f"{type(self.policy).__name__} is not a program; ProgPolicy and PRLPolicy are")
         origin = {"env": self.env_id, "seed": self.seed, "timesteps": self.num_timesteps}
-        return self.policy.program(
-            self.input_names, self.output_names, self.interaction_history, **{**origin, **metadata}
-        )
+        # A saved model's tuples are loaded as lists.
+        inputs, outputs = (tuple(names or ()) for names in (self.input_names, self.output_names))
+        return self.policy.program(inputs, outputs, self.interaction_history, **{**origin, **metadata})
 
     def predict(
         self,

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from gymnasium.envs.registration import load_env_creator
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
@@ -101,11 +102,11 @@ def make_config(
     """
     if algo not in ALGORITHMS:
         raise unknown("algorithm", algo, ALGORITHMS)
-    spec_of(env_id)
     hyperparams = {**load_hyperparams(algo, env_id), **(overrides or {})}
     if n_timesteps is not None:
         hyperparams["n_timesteps"] = n_timesteps
     env_kwargs = {**parse_kwargs("env_kwargs", hyperparams.pop("env_kwargs", None)), **(env_kwargs or {})}
+    _check_env_kwargs(env_id, env_kwargs)
     accepted = _accepted(algo)
     for name in hyperparams:
         if name not in accepted:
@@ -114,6 +115,15 @@ def make_config(
     config = RunConfig(algo, env_id, seed, env_kwargs, checked, device)
     _check_policy(config)
     return config
+
+
+def _check_env_kwargs(env_id: str, env_kwargs: Mapping[str, Any]) -> None:
+    constructor = inspect.signature(load_env_creator(str(spec_of(env_id).entry_point))).parameters
+    if any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in constructor.values()):
+        return
+    for name in env_kwargs:
+        if name not in constructor:
+            raise unknown("environment argument", name, constructor)
 
 
 def _accepted(algo: str) -> dict[str, Any]:
@@ -214,7 +224,7 @@ def build_model(
         arguments.pop("interaction_history", None)
         policy = _OWN_POLICIES[algorithm].get(policy, policy)
         return algorithm(policy, make_env(config), **arguments), wrapper
-    except AssertionError as error:  # what SB3 raises for some values
+    except (AssertionError, RuntimeError) as error:  # what SB3 and torch raise for some values
         raise ValueError(str(error)) from None
 
 

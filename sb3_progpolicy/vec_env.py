@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from importlib import import_module
 from typing import Any
 
 import gymnasium as gym
@@ -108,7 +109,10 @@ def make_fast_vec_env(env_id: str, n_envs: int, seed: int | None = None, **env_k
     """
     if n_envs < 1:
         raise ValueError(f"n_envs={n_envs} is not accepted; it is at least 1")
-    spec = gym.spec(env_id)
+    module, _, name = env_id.rpartition(":")
+    if module:
+        import_module(module)  # registers the id; gym.spec does not know the prefix
+    spec = gym.spec(name)
     if spec.vector_entry_point is not None:
         batch = gym.make_vec(env_id, num_envs=n_envs, vectorization_mode="vector_entry_point", **env_kwargs)
         if batch.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP:

@@ -11,7 +11,7 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_progpolicy import ReptileCheckpoint, ReptilePPO, TaskDistribution
 
-TIMESTEPS = 8 * 32 * 2 * 12
+TIMESTEPS = 8 * 32 * 2 * 8
 
 
 def make(policy):
@@ -38,7 +38,7 @@ def make(policy):
 
 def train(model, path):
     """Train to the end, with checkpoints, and return the final parameters by name."""
-    checkpoint = ReptileCheckpoint(path, save_freq=1024, verbose=1)
+    checkpoint = ReptileCheckpoint(path, save_freq=512, verbose=1)
     model.learn(TIMESTEPS - model.num_timesteps, checkpoint, reset_num_timesteps=model.num_timesteps == 0)
     model.save(path.with_suffix(".final.zip"))
     return parameters(path)
@@ -114,7 +114,7 @@ class StopAt(ReptileCheckpoint):
         return True
 
 
-@pytest.mark.parametrize("policy", ["MlpLstmPolicy", "MlpPolicy", "PRLPolicy"])
+@pytest.mark.parametrize("policy", ["MlpPolicy", "PRLPolicy"])
 def test_resumed_training_ends_with_the_same_bits_whatever_the_policy(policy, tmp_path, one_thread):
     stopped = StopAt(tmp_path / "stopped.zip")
     stopped.stop_at = TIMESTEPS // 2 + 100

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
 from progpolicy_envs.planners import hanoi as planner
-from progpolicy_envs.rendering import Display, hanoi_frame
+from progpolicy_envs.planning import PlanningEnv
+from progpolicy_envs.rendering import hanoi_frame
 from progpolicy_envs.variation import IntParameter, Variation, VariationSpace
 from progpolicy_envs.vector import PlanningVectorEnv
 
@@ -56,10 +56,10 @@ def _peg_pairs(variation: Variation) -> list[tuple[int, int]]:
 
 def _draw_pegs(pairs: list[tuple[int, int]], rng: np.random.Generator) -> tuple[int, int]:
     """Draw source and target of an episode."""
-    return pairs[int(rng.integers(len(pairs)))] if len(pairs) > 1 else pairs[0]
+    return pairs[int(len(pairs) * rng.random())] if len(pairs) > 1 else pairs[0]
 
 
-class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
+class HanoiEnv(PlanningEnv):
     """Move a tower of discs from one peg to another, one disc at a time, never a larger disc on a smaller one.
 
     ## Description
@@ -120,7 +120,6 @@ class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
     * v0: initial version
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array", "ansi"], "render_fps": 4}
     variations: ClassVar[VariationSpace] = VARIATIONS
     observation_names: ClassVar[tuple[str, ...]] = OBSERVATION_NAMES
     action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
@@ -128,15 +127,14 @@ class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
     def __init__(
         self, n_discs: int = 3, source: int | str = 0, target: int | str = 2, render_mode: str | None = None
     ) -> None:
+        super().__init__(render_mode)
         self.variation = check_variation(
             self.variations.update({}, {"n_discs": n_discs, "source": source, "target": target})
         )
         self.observation_space = _OBSERVATION_SPACE
         self.action_space = spaces.Discrete(len(MOVES))
-        self.render_mode = render_mode
         self.source, self.target = _draw_pegs(_peg_pairs(self.variation), self.np_random)
         self.discs: list[int] = [self.source] * self.variation["n_discs"]
-        self._display = Display(self.metadata["render_fps"])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -167,9 +165,7 @@ class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
         :return: observation, reward, terminated, truncated, info
         :raises ValueError: if the action is out of range
         """
-        if not self.action_space.contains(action):
-            raise ValueError(f"action={action!r} is not accepted; actions are integers from 0 to {len(MOVES) - 1}")
-        source, target = MOVES[int(action)]
+        source, target = MOVES[self._check_action(action)]
         tops = self._tops()
         reward = STEP_REWARD
         if tops[source] < tops[target]:
@@ -180,19 +176,6 @@ class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
         reward += GOAL_REWARD * solved
         self._show()
         return self._observe(), reward, solved, False, {"is_success": solved}
-
-    def render(self) -> Any:
-        """Return a picture ``(height, width, 3)`` of bytes, or a text, or show a window, as ``render_mode`` says."""
-        if self.render_mode == "ansi":
-            return self._text()
-        if self.render_mode == "rgb_array":
-            return self._frame()
-        self._show()
-        return None
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        self._display.close()
 
     def _tops(self) -> list[int]:
         """Index of the top disc of each peg, 0 the smallest; ``n_discs`` for an empty peg."""
@@ -211,10 +194,6 @@ class HanoiEnv(gym.Env[NDArray[np.float32], np.int64]):
             shade = top + (empty and not continues)
             observation[peg] = (sum((top > other) - (top < other) for other in tops) / 2, 2 * (shade % 2) - 1, empty)
         return observation.reshape(-1)
-
-    def _show(self) -> None:
-        if self.render_mode == "human":
-            self._display.show(self._frame())
 
     def _frame(self) -> NDArray[np.uint8]:
         return hanoi_frame(self.discs, self.source, self.target)
@@ -308,12 +287,12 @@ class HanoiVectorEnv(PlanningVectorEnv):
 
     def _place_pegs(self, rows: NDArray[np.intp]) -> None:
         """Read or draw source and target, and colour the bases with them."""
-        if not rows.size:
-            return
-        pegs = np.array([_draw_pegs(self._pairs[row], self._generators[row]) for row in rows])
-        self._source[rows], self._target[rows] = pegs.T
-        continues = (np.arange(N_PEGS) == pegs[:, :1]) | (np.arange(N_PEGS) == pegs[:, 1:])
-        self._bases[rows] = ((self._n_discs[rows, None] + ~continues) % 2) @ (1 << np.arange(N_PEGS))
+        for row in rows:
+            source, target = _draw_pegs(self._pairs[row], self._generators[row])
+            self._source[row], self._target[row] = source, target
+            # Bit per peg: source and target continue the alternation of n discs, the third base does not.
+            continued = (1 << source) | (1 << target)
+            self._bases[row] = continued if self._n_discs[row] % 2 else 2**N_PEGS - 1 - continued
 
     def _reset_rows(self, rows: NDArray[np.intp]) -> None:
         self._place_pegs(rows[self._random[rows]])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Literal
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
@@ -21,7 +20,8 @@ from progpolicy_envs.layouts import (
     random_layout,
 )
 from progpolicy_envs.planners import hiking as planner
-from progpolicy_envs.rendering import Display, hiking_frame
+from progpolicy_envs.planning import PlanningEnv
+from progpolicy_envs.rendering import hiking_frame
 from progpolicy_envs.variation import ChoiceParameter, IntParameter, Variation, VariationSpace
 from progpolicy_envs.vector import PlanningVectorEnv
 
@@ -82,7 +82,7 @@ def draw_task(generator: np.random.Generator, variation: Variation) -> tuple[Lay
     return layout, generator.permutation(layout.star_cells)[: variation["n_stars"]]
 
 
-class HikingEnv(gym.Env[NDArray[np.float32], np.int64]):
+class HikingEnv(PlanningEnv):
     """Walk the pathways of a map and collect every star.
 
     ## Description
@@ -169,16 +169,15 @@ class HikingEnv(gym.Env[NDArray[np.float32], np.int64]):
         observation: Observation = "map",
         render_mode: str | None = None,
     ) -> None:
+        super().__init__(render_mode)
         self.variation = self.variations.update({}, {"n_stars": n_stars, "layout": layout})
         self.observation = check_observation(observation)
         self.observation_names = OBSERVATION_NAMES[self.observation]
         self.observation_space = _OBSERVATION_SPACE
         self.action_space = spaces.Discrete(len(ACTION_NAMES))
-        self.render_mode = render_mode
         self.layout = LAYOUTS["valley"]
         self.hiker = self.layout.start
         self.stars: set[int] = set()
-        self._display = Display(self.metadata["render_fps"])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -209,9 +208,7 @@ class HikingEnv(gym.Env[NDArray[np.float32], np.int64]):
         :return: observation, reward, terminated, truncated, info
         :raises ValueError: if the action is out of range
         """
-        if not self.action_space.contains(action):
-            raise ValueError(f"action={action!r} is not accepted; actions are integers from 0 to 3")
-        ahead = int(NEIGHBOURS[self.hiker, int(action)])
+        ahead = int(NEIGHBOURS[self.hiker, self._check_action(action)])
         reward = STEP_REWARD
         if ahead == self.hiker or not self.layout.is_path[ahead]:
             reward += ILLEGAL_REWARD
@@ -224,19 +221,6 @@ class HikingEnv(gym.Env[NDArray[np.float32], np.int64]):
         self._show()
         return self._observe(), reward, solved, False, {"is_success": solved}
 
-    def render(self) -> Any:
-        """Return a picture ``(height, width, 3)`` of bytes, or a text, or show a window, as ``render_mode`` says."""
-        if self.render_mode == "ansi":
-            return self._text()
-        if self.render_mode == "rgb_array":
-            return self._frame()
-        self._show()
-        return None
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        self._display.close()
-
     def _observe(self) -> NDArray[np.float32]:
         cells = np.where(self.layout.is_path, 0, BLOCKED).astype(np.float32)
         cells[list(self.stars)] = STAR[self.observation]
@@ -248,10 +232,6 @@ class HikingEnv(gym.Env[NDArray[np.float32], np.int64]):
         row, column = divmod(self.hiker, N_COLUMNS)
         window = framed.reshape(-1, _WIDTH)[row : row + _WINDOW, column : column + _WINDOW]
         return np.delete(window, _OWN_CELL)
-
-    def _show(self) -> None:
-        if self.render_mode == "human":
-            self._display.show(self._frame())
 
     def _frame(self) -> NDArray[np.uint8]:
         return hiking_frame(self.layout.rows, divmod(self.hiker, N_COLUMNS), self._places(), self.variation["n_stars"])

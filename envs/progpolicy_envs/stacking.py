@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
 from progpolicy_envs.layouts import DIRECTIONS
 from progpolicy_envs.planners import stacking as planner
-from progpolicy_envs.rendering import Display, stacking_frame
+from progpolicy_envs.planning import PlanningEnv
+from progpolicy_envs.rendering import stacking_frame
 from progpolicy_envs.variation import IntParameter, Variation, VariationSpace
 from progpolicy_envs.vector import PlanningVectorEnv
 
@@ -46,7 +46,7 @@ def draw_task(generator: np.random.Generator, variation: Variation) -> tuple[NDA
     return generator.permutation(N_CELLS)[: variation["n_plates"]], int(generator.integers(N_CELLS))
 
 
-class StackingEnv(gym.Env[NDArray[np.float32], np.int64]):
+class StackingEnv(PlanningEnv):
     """Move a gripper over a table and pick plates up one by one, the largest first, onto one stack.
 
     ## Description
@@ -114,13 +114,12 @@ class StackingEnv(gym.Env[NDArray[np.float32], np.int64]):
     action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
 
     def __init__(self, n_plates: int = 3, render_mode: str | None = None) -> None:
+        super().__init__(render_mode)
         self.variation = self.variations.update({}, {"n_plates": n_plates})
         self.observation_space = _OBSERVATION_SPACE
         self.action_space = spaces.Discrete(len(ACTION_NAMES))
-        self.render_mode = render_mode
         self.plates: list[tuple[int, int]] = []
         self.gripper = (0, 0)
-        self._display = Display(self.metadata["render_fps"])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -152,8 +151,7 @@ class StackingEnv(gym.Env[NDArray[np.float32], np.int64]):
         :return: observation, reward, terminated, truncated, info
         :raises ValueError: if the action is out of range
         """
-        if not self.action_space.contains(action):
-            raise ValueError(f"action={action!r} is not accepted; actions are integers from 0 to {PICK}")
+        action = self._check_action(action)
         reward = STEP_REWARD
         if action == PICK:
             if self.gripper == next(iter(self.plates), None):
@@ -162,7 +160,7 @@ class StackingEnv(gym.Env[NDArray[np.float32], np.int64]):
             else:
                 reward += ILLEGAL_REWARD
         else:
-            down, right = DIRECTIONS[ACTION_NAMES[int(action)]]
+            down, right = DIRECTIONS[ACTION_NAMES[action]]
             row, column = self.gripper[0] + down, self.gripper[1] + right
             if 0 <= row < N_SIDE and 0 <= column < N_SIDE:
                 self.gripper = (row, column)
@@ -171,19 +169,6 @@ class StackingEnv(gym.Env[NDArray[np.float32], np.int64]):
         solved = not self.plates
         self._show()
         return self._observe(), reward, solved, False, {"is_success": solved}
-
-    def render(self) -> Any:
-        """Return a picture ``(height, width, 3)`` of bytes, or a text, or show a window, as ``render_mode`` says."""
-        if self.render_mode == "ansi":
-            return self._text()
-        if self.render_mode == "rgb_array":
-            return self._frame()
-        self._show()
-        return None
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        self._display.close()
 
     def _observe(self) -> NDArray[np.float32]:
         n_plates = self.variation["n_plates"]
@@ -194,10 +179,6 @@ class StackingEnv(gym.Env[NDArray[np.float32], np.int64]):
             observation[_STACK + slot] = (n_plates - slot) / n_plates
         observation[_GRIPPER:] = [2 * place / (N_SIDE - 1) - 1 for place in self.gripper]
         return observation
-
-    def _show(self) -> None:
-        if self.render_mode == "human":
-            self._display.show(self._frame())
 
     def _frame(self) -> NDArray[np.uint8]:
         return stacking_frame(N_SIDE, self.plates, self.variation["n_plates"], self.gripper)

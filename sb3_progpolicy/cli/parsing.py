@@ -88,6 +88,16 @@ def _expand(pair: str, item: str) -> Sequence[Any]:
     return range(low, high + 1)
 
 
+def check_folder(output: Path) -> None:
+    """Find out before the work that a file cannot be written.
+
+    :param output: the file
+    :raises ValueError: if its folder does not exist
+    """
+    if not output.parent.is_dir():
+        raise ValueError(f"-o {str(output)!r} is not accepted; the folder {str(output.parent)!r} does not exist")
+
+
 def default_variations(env_id: str) -> list[dict[str, Any]]:
     """Return a domain's training sizes and its unseen variations, or the environment as it is for any other id."""
     domain = DOMAINS.get(env_id.rpartition(":")[2])

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sb3_progpolicy.cli.parsing import Source, default_variations, find_source, parse_variations
+from sb3_progpolicy.cli.parsing import Source, check_folder, default_variations, find_source, parse_variations
 from sb3_progpolicy.cli.streams import quiet_stdout
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.programs.files import write_atomically
@@ -34,6 +34,7 @@ def render(
     """Play one episode and write it as an animated GIF."""
     if output.suffix.lower() != ".gif":
         raise ValueError(f"-o {str(output)!r} is not accepted; the file is a .gif")
+    check_folder(output)
     if planner and random:
         raise ValueError("--planner and --random are not accepted together")
     if semantics not in ("crisp", "soft"):
@@ -134,7 +135,8 @@ def _play(env: Any, act: Act, observation: Any, optimal: int | None, cap: int) -
     from rich.progress import Progress
 
     animation, reward, done, info = _Animation(env.render()), 0.0, False, dict[str, Any]()
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("playing", total=optimal or cap)
         while not done:
             observation, reward, terminated, truncated, info = env.step(act(observation, reward, done))

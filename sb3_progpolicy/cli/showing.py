@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sb3_progpolicy.cli.parsing import find_source
+from sb3_progpolicy.cli.parsing import check_folder, find_source
 from sb3_progpolicy.cli.streams import quiet_stdout
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.programs.files import write_atomically
@@ -28,6 +28,8 @@ def show(
     """Print a program as text, LaTeX, Graphviz or standalone Python, or draw it."""
     if format_ not in FORMATS:
         raise unknown("format", format_, FORMATS)
+    if output is not None:
+        check_folder(output)
     with quiet_stdout():
         source = find_source(run_or_name)
         if source.program is None:

@@ -1,0 +1,82 @@
+import pytest
+
+from sb3_progpolicy.hyperparams import algorithms, load_hyperparams, parse_kwargs, parse_value
+from sb3_progpolicy.training import ALGORITHMS, build_model, make_config
+
+
+@pytest.mark.parametrize("algo", list(ALGORITHMS))
+@pytest.mark.parametrize("env_id", ["Hanoi-v0", "CartPole-v1"])
+def test_shipped_hyperparameters_build_a_model(algo, env_id):
+    config = make_config(algo, env_id, seed=0)
+    model, _ = build_model(config)
+    assert model.n_steps == config.hyperparams["n_steps"]
+    assert model.n_envs == config.hyperparams["n_envs"]
+
+
+def test_there_is_a_file_for_every_algorithm():
+    assert set(algorithms()) == set(ALGORITHMS)
+
+
+def test_entry_of_an_environment_starts_from_the_default_one():
+    hanoi, default = (load_hyperparams("reptile_ppo", env_id) for env_id in ("Hanoi-v0", "Other-v0"))
+    assert hanoi["n_envs"] == default["n_envs"]
+    assert hanoi["n_timesteps"] != default["n_timesteps"]
+    assert load_hyperparams("reptile_ppo", "progpolicy_envs:Hanoi-v0") == hanoi
+
+
+@pytest.mark.parametrize("value", [{"depth": 3, "cell": "gru"}, "dict(depth=3, cell='gru')"])
+def test_policy_kwargs_are_a_mapping_or_the_zoos_dict(value):
+    assert parse_kwargs("policy_kwargs", value) == {"depth": 3, "cell": "gru"}
+
+
+def test_nested_dict_is_parsed():
+    assert parse_kwargs("policy_kwargs", "dict(net_arch=dict(pi=[8], vf=[16]))") == {
+        "net_arch": {"pi": [8], "vf": [16]}
+    }
+
+
+@pytest.mark.parametrize(
+    "value", ["dict(depth=__import__('os').getpid())", "open('x')", "dict(**{'a': 1})", "dict(1)", "[1]", "dict(", 7]
+)
+def test_nothing_in_policy_kwargs_is_run(value):
+    with pytest.raises(ValueError, match="policy_kwargs="):
+        parse_kwargs("policy_kwargs", value)
+
+
+def test_number_with_an_exponent_is_a_number():
+    assert parse_value("1e-3") == 1e-3
+    assert make_config("reptile_ppo", "Hanoi-v0", 0, overrides={"n_timesteps": "4e5"}).n_timesteps == 400_000
+
+
+def test_linear_schedule_falls_to_zero():
+    config = make_config("ppo", "CartPole-v1", 0, overrides={"learning_rate": "lin_0.002"})
+    model, _ = build_model(config)
+    assert [model.lr_schedule(remaining) for remaining in (1.0, 0.5, 0.0)] == pytest.approx([0.002, 0.001, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        ({"n_step": 3}, "nearest: n_steps"),
+        ({"n_steps": "abc"}, "n_steps='abc'"),
+        ({"n_steps": 0}, "at least 1"),
+        ({"n_steps": 2.5}, "whole number"),
+        ({"learning_rate": "exp_0.1"}, "lin_<number>"),
+        ({"meta_update": 1}, "true or false"),
+        ({"policy": "ProgPol"}, "nearest: ProgPolicy"),
+        ({"policy_kwargs": {"dept": 3}}, "nearest: depth"),
+        ({"gamma": "high"}, "gamma='high'"),
+    ],
+)
+def test_slip_is_named(overrides, said):
+    with pytest.raises(ValueError, match=said):
+        make_config("reptile_ppo", "Hanoi-v0", 0, overrides=overrides)
+
+
+def test_unknown_names_are_answered_with_the_nearest():
+    with pytest.raises(ValueError, match="nearest: reptile_ppo"):
+        make_config("reptil_ppo", "Hanoi-v0", 0)
+    with pytest.raises(ValueError, match="Hanoi-v0"):
+        make_config("reptile_ppo", "Hanoy-v0", 0)
+    with pytest.raises(ValueError, match="nearest: n_discs"):
+        make_config("reptile_ppo", "Hanoi-v0", 0, env_kwargs={"n_disc": 3})

@@ -1,0 +1,159 @@
+"""Task distributions: what is drawn, when, and how it is put in force in a real environment."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from progpolicy_envs import DOMAINS
+from sb3_progpolicy import TaskDistribution
+from sb3_progpolicy.tasks import CurriculumSampler, FailureSampler, RemakeOnVariation, default_tasks
+from sb3_progpolicy.vec_env import make_fast_vec_env
+
+
+def drawn(tasks, n, progress=0.0, seed=0):
+    rng = np.random.default_rng(seed)
+    return [tasks.sample(rng, progress)[0] for _ in range(n)]
+
+
+def test_mapping_makes_all_combinations_and_a_list_is_taken_as_it_is():
+    tasks = TaskDistribution({"a": [1, 2], "b": range(3, 5), "c": np.array([0.5])})
+    assert tasks.variations == [{"a": a, "b": b, "c": 0.5} for a in (1, 2) for b in (3, 4)]
+    assert len(tasks) == 4
+    assert TaskDistribution([{"a": 1}, {"a": 2, "b": 1}]).variations == [{"a": 1}, {"a": 2, "b": 1}]
+
+
+def test_callables_are_drawn_anew_each_time():
+    tasks = TaskDistribution({"n": [1, 2], "length": lambda rng: rng.uniform(0.3, 1.0)})
+    assert len(tasks) == 2
+    lengths = [variation["length"] for _, variation in drawn(tasks, 50)]
+    assert len(set(lengths)) == 50
+    assert 0.3 <= min(lengths) < max(lengths) <= 1.0
+
+
+def test_equal_seeds_draw_equal_tasks():
+    tasks = TaskDistribution({"n": range(9), "x": lambda rng: rng.normal()})
+    assert drawn(tasks, 30, seed=1) == drawn(tasks, 30, seed=1)
+    assert drawn(tasks, 30, seed=1) != drawn(tasks, 30, seed=2)
+
+
+def test_uniform_sampler_draws_all_equally_often():
+    counts = np.bincount([index for index, _ in drawn(TaskDistribution({"n": range(4)}), 4000)])
+    np.testing.assert_allclose(counts, 1000, atol=120)
+
+
+def test_curriculum_lets_in_one_variation_after_the_other():
+    tasks = TaskDistribution({"n": range(4)}, sampler=CurriculumSampler(fraction=0.8))
+    for progress, let_in in ((0.0, 1), (0.19, 1), (0.21, 2), (0.41, 3), (0.61, 4), (1.0, 4)):
+        assert {index for index, _ in drawn(tasks, 100, progress)} == set(range(let_in))
+
+
+def test_failure_sampler_prefers_what_fails():
+    tasks = TaskDistribution({"n": range(3)}, sampler=FailureSampler(floor=0.1))
+    tasks.record(0, 1.0)
+    tasks.record(1, 0.0)
+    counts = np.bincount([index for index, _ in drawn(tasks, 2300)])
+    np.testing.assert_allclose(counts, [100, 1100, 1100], atol=110)  # the third is untried: as if it failed
+
+
+def test_success_rates_are_running_means():
+    tasks = TaskDistribution({"n": range(2)})
+    assert np.isnan(tasks.success_rates).all()
+    tasks.record(1, 1.0)
+    assert tasks.success_rates[1] == 1.0
+    tasks.record(1, 0.0)
+    assert tasks.success_rates[1] == pytest.approx(1 - TaskDistribution.SUCCESS_SMOOTHING)
+
+
+def test_several_tasks_at_once_are_different_as_long_as_there_are_enough():
+    tasks = TaskDistribution({"n": range(3)})
+    for seed in range(20):
+        indices = [index for index, _ in tasks.sample(np.random.default_rng(seed), n_tasks=5)]
+        assert set(indices[:3]) == {0, 1, 2}
+        assert len(set(indices[3:])) == 2
+
+
+def test_domains_train_on_their_own_variations_and_others_as_they_are():
+    for env_id in ("Hanoi-v0", "progpolicy_envs:Hanoi-v0"):
+        assert default_tasks(env_id).variations == list(DOMAINS["Hanoi-v0"].train)
+    assert default_tasks("CartPole-v1").variations == default_tasks(None).variations == [{}]
+
+
+@pytest.mark.parametrize("make", [make_fast_vec_env, make_vec_env])
+def test_options_are_in_force_from_the_next_reset(make):
+    env = make("Hanoi-v0", 3)
+    tasks = TaskDistribution({"n_discs": range(1, 9)})
+    tasks.put_in_force(env, [{"n_discs": n} for n in (2, 5, 7)])
+    env.reset()
+    assert [info["variation"]["n_discs"] for info in env.unwrapped.reset_infos] == [2, 5, 7]
+
+
+def test_attributes_are_set_in_the_environment_itself():
+    env = make_vec_env("CartPole-v1", 2)
+    tasks = TaskDistribution({"length": [0.3, 0.9], "force_mag": [5.0, 20.0]}, apply="attributes")
+    tasks.put_in_force(env, [{"length": 0.3, "force_mag": 20.0}, {"length": 0.9, "force_mag": 5.0}])
+    assert [single.unwrapped.length for single in env.envs] == [0.3, 0.9]
+    # Force decides how far one push to the right goes.
+    env.seed(0)
+    env.reset()
+    speeds = env.step(np.array([1, 1]))[0][:, 1]
+    assert speeds[0] > speeds[1] + 0.15
+
+
+def test_constructor_arguments_make_the_environment_anew():
+    env = DummyVecEnv([lambda: gym.wrappers.RecordEpisodeStatistics(RemakeOnVariation("Pendulum-v1", g=9.0))] * 2)
+    before = [single.unwrapped for single in env.envs]
+    TaskDistribution({"g": [1.0, 2.0]}, apply="constructor").put_in_force(env, [{"g": 1.0}, {"g": 2.0}])
+    assert [single.unwrapped.g for single in env.envs] == [1.0, 2.0]
+    assert all(single.unwrapped is not old for single, old in zip(env.envs, before, strict=True))
+    env.reset()
+    env.step(np.zeros((2, 1)))
+    TaskDistribution([{}], apply="constructor").put_in_force(env, [{}, {}])
+    assert [single.unwrapped.g for single in env.envs] == [9.0, 9.0]
+
+
+def test_attribute_that_the_environment_lacks_is_refused():
+    tasks = TaskDistribution({"lenght": [1.0]}, apply="attributes")
+    with pytest.raises(ValueError, match="'lenght' is not accepted"):
+        tasks.put_in_force(make_vec_env("CartPole-v1", 1), [{"lenght": 1.0}])
+
+
+@pytest.mark.parametrize("apply", ["attributes", "constructor"])
+def test_environments_that_cannot_be_varied_so_are_refused(apply):
+    tasks = TaskDistribution({"n_discs": [1]}, apply=apply)
+    with pytest.raises(ValueError, match="these environments are not accepted"):
+        tasks.put_in_force(make_fast_vec_env("Hanoi-v0", 2), [{"n_discs": 1}] * 2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([],), "at least one variation"),
+        (({},), "at least one variation"),
+        (({"n": 3},), "n=3 is not accepted"),
+        (({"n": "abc"},), "n='abc' is not accepted"),
+        (({"n": []},), "n=\\[\\] is not accepted"),
+        (([1, 2],), "mapping"),
+        (("abc",), "mapping"),
+        (({"n": [1]}, "best"), "known samplers: uniform, curriculum, failure"),
+        (({"n": [1]}, "uniform", "magic"), "known: options, attributes, constructor"),
+    ],
+)
+def test_what_makes_no_distribution_is_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        TaskDistribution(*arguments)
+
+
+def test_samplers_refuse_values_out_of_range():
+    with pytest.raises(ValueError, match="fraction=0"):
+        CurriculumSampler(0)
+    with pytest.raises(ValueError, match="floor=0"):
+        FailureSampler(0)
+
+
+def test_labels_tell_variations_apart():
+    tasks = TaskDistribution({"n": [1, 2], "x": lambda rng: 0})
+    assert len({tasks.label(0), tasks.label(1)}) == 2
+    assert "n=1" in tasks.label(0)
+    assert TaskDistribution([{}]).label(0) == "default"

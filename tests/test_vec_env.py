@@ -1,0 +1,84 @@
+"""The batched environment against single ones in SB3's own vectorisation."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import SyncVectorEnv
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, is_vecenv_wrapped
+
+from sb3_progpolicy.vec_env import BatchedVecEnv, make_fast_vec_env
+
+N_ENVS = 4
+
+
+def test_batched_hanoi_equals_single_ones_step_for_step():
+    options = [{"n_discs": n, "source": "random", "target": "random"} for n in (1, 1, 2, 3)]
+    batched = make_fast_vec_env("Hanoi-v0", N_ENVS, seed=3)
+    single = make_vec_env("Hanoi-v0", N_ENVS, seed=3)
+    rng = np.random.default_rng(0)
+    ends = {True: 0, False: 0}
+    for task in range(2):
+        for env in (batched, single):
+            env.seed(7 + task)
+            env.set_options(options[:: 1 - 2 * task])
+        np.testing.assert_array_equal(batched.reset(), single.reset())
+        assert batched.unwrapped.reset_infos == single.unwrapped.reset_infos
+        for _ in range(1100):
+            actions = rng.integers(6, size=N_ENVS)
+            (obs_a, rewards_a, dones_a, infos_a), (obs_b, rewards_b, dones_b, infos_b) = (
+                env.step(actions) for env in (batched, single)
+            )
+            np.testing.assert_array_equal(obs_a, obs_b)
+            np.testing.assert_allclose(rewards_a, rewards_b)
+            np.testing.assert_array_equal(dones_a, dones_b)
+            for row in np.flatnonzero(dones_a):
+                a, b = infos_a[row], infos_b[row]
+                np.testing.assert_array_equal(a["terminal_observation"], b["terminal_observation"])
+                for name in ("is_success", "TimeLimit.truncated"):
+                    assert a[name] == b[name]
+                    assert type(a[name]) is bool
+                assert a["episode"]["l"] == b["episode"]["l"]
+                assert a["episode"]["r"] == pytest.approx(b["episode"]["r"], abs=1e-4)
+                ends[a["TimeLimit.truncated"]] += 1
+    assert min(ends.values()) > 0, "episodes of both ends are compared"
+
+
+def test_batched_form_is_taken_where_there_is_one():
+    hanoi, cartpole = make_fast_vec_env("Hanoi-v0", 3), make_fast_vec_env("CartPole-v1", 2)
+    assert isinstance(hanoi.unwrapped, BatchedVecEnv)
+    assert is_vecenv_wrapped(hanoi, VecMonitor)
+    # CartPole has a batched form, but it does not reset within the step.
+    assert isinstance(cartpole.unwrapped, DummyVecEnv)
+    assert (hanoi.num_envs, cartpole.num_envs) == (3, 2)
+
+
+def test_environment_arguments_reach_both_forms():
+    assert make_fast_vec_env("Hanoi-v0", 2, n_discs=5).get_attr("row_variations")[0][0]["n_discs"] == 5
+    assert make_fast_vec_env("Pendulum-v1", 2, g=3.0).get_attr("g") == [3.0, 3.0]
+
+
+def test_equal_seeds_give_equal_starts():
+    def starts(seed):
+        env = make_fast_vec_env("Hanoi-v0", 16, seed, source="random", target="random")
+        return env.reset()
+
+    np.testing.assert_array_equal(starts(1), starts(1))
+    assert (starts(1) != starts(2)).any()
+
+
+def test_other_autoreset_modes_are_refused():
+    with pytest.raises(ValueError, match="SAME_STEP"):
+        BatchedVecEnv(SyncVectorEnv([lambda: gym.make("CartPole-v1")]))
+
+
+def test_no_environment_is_refused():
+    with pytest.raises(ValueError, match="n_envs=0"):
+        make_fast_vec_env("Hanoi-v0", 0)
+
+
+def test_different_option_names_for_one_batch_are_refused():
+    env = make_fast_vec_env("Hanoi-v0", 2)
+    env.set_options([{"n_discs": 1}, {"source": 1}])
+    with pytest.raises(ValueError, match="same option names"):
+        env.reset()
