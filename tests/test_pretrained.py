@@ -1,10 +1,14 @@
 import subprocess
 import sys
 
+import gymnasium as gym
 import pytest
 
 import sb3_progpolicy.pretrained as pretrained
+from progpolicy_envs.hanoi import MOVES
 from sb3_progpolicy import load_pretrained, pretrained_names
+from sb3_progpolicy.programs import ProgramRunner, join_inputs
+from tests.envs.test_hanoi import Referee
 from tests.handwritten.hanoi import hanoi_program
 
 
@@ -32,3 +36,20 @@ def test_every_shipped_program_loads():
 def test_loading_needs_no_torch():
     code = "import sys, sb3_progpolicy as s; s.pretrained_names(); s.load_pretrained; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+@pytest.mark.parametrize("semantics", ["soft", "crisp"])
+@pytest.mark.parametrize("n_discs", range(1, 11))
+def test_moves_of_the_shipped_program_obey_the_puzzles_rules_and_are_the_fewest(n_discs, semantics):
+    program = load_pretrained("Hanoi-v0")
+    env = gym.make("Hanoi-v0", n_discs=n_discs, max_episode_steps=2**n_discs)
+    runner, referee = ProgramRunner(program, semantics=semantics), Referee(n_discs, source=0)
+    observation, _ = env.reset()
+    action, reward, ended, n_moves = None, 0.0, False, 0
+    while not ended:
+        action = runner.act(join_inputs(program, observation, action, reward, ended))
+        referee.move(*MOVES[int(action[0])])
+        observation, reward, terminated, truncated, _ = env.step(action[0])
+        ended, n_moves = terminated or truncated, n_moves + 1
+    assert referee.piles[2] == list(range(n_discs, 0, -1))
+    assert n_moves == 2**n_discs - 1
