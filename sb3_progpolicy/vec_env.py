@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import import_module
 from typing import Any
@@ -11,8 +12,11 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+
+from progpolicy_envs import DOMAINS
+from sb3_progpolicy.grouped import GroupedSubprocVecEnv
 
 
 class BatchedVecEnv(VecEnv):
@@ -99,8 +103,8 @@ class BatchedVecEnv(VecEnv):
 def make_fast_vec_env(env_id: str, n_envs: int, seed: int | None = None, **env_kwargs: Any) -> VecEnv:
     """Build the fastest vectorised environment of an id, monitored.
 
-    The batched form is taken where the id has one that resets within the step; otherwise ``n_envs`` environments run
-    in this process, one after the other.
+    The batched form is taken where the id has one that resets within the step. Several environments of a domain that
+    is a simulation share as many processes as there are cores; all others run in this process, one after the other.
 
     :param env_id: a registered id, with or without a module prefix
     :param n_envs: number of environments, at least 1
@@ -120,4 +124,7 @@ def make_fast_vec_env(env_id: str, n_envs: int, seed: int | None = None, **env_k
             venv.seed(seed)
             return VecMonitor(venv)
         batch.close()
-    return make_vec_env(env_id, n_envs=n_envs, seed=seed, env_kwargs=env_kwargs)
+    domain = DOMAINS.get(env_id.rpartition(":")[2])
+    grouped = domain is not None and domain.simulation and min(n_envs, os.cpu_count() or 1) > 1
+    vec_env_cls = GroupedSubprocVecEnv if grouped else DummyVecEnv
+    return make_vec_env(env_id, n_envs=n_envs, seed=seed, env_kwargs=env_kwargs, vec_env_cls=vec_env_cls)

@@ -1,0 +1,321 @@
+"""Many simulations in few processes: every worker steps its share of the environments, one message per step."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from multiprocessing.connection import Connection
+from types import ModuleType
+from typing import Any
+
+import cloudpickle
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+_OK, _RAISED, _BROKEN = "ok", "raised", "broken"
+_SECONDS_TO_CLOSE = 5.0
+
+
+class RemoteTraceback(Exception):
+    """The traceback in the worker, as the cause of an error that is raised again in this process."""
+
+    def __str__(self) -> str:
+        """Return the text."""
+        return "\n" + str(self.args[0])
+
+
+class GroupedSubprocVecEnv(VecEnv):
+    """Runs ``n_envs`` environments in ``n_workers`` processes, each of which steps its share one after the other.
+
+    SB3's ``SubprocVecEnv`` starts a process for every environment and exchanges a message with each of them at every
+    step; with more environments than cores they wait for one another. Here there are as many processes as cores. Each
+    worker holds a ``DummyVecEnv``, so all results are exactly those of ``DummyVecEnv(env_fns)``; those that carry no
+    news, such as the infos of environments that report nothing, are not sent.
+
+    The workers do not run the calling script again, which therefore needs no ``if __name__ == "__main__":`` block.
+    What the environments need from it must be reached from ``env_fns``: an id that the script registers is unknown in
+    the workers unless the function registers it.
+
+    :param env_fns: make one environment each; they are called in the workers and sent there by cloudpickle
+    :param n_workers: number of processes, at least 1; by default one for each core. More than ``len(env_fns)`` are
+        not started
+    :raises ValueError: if there is no environment or no worker, or whatever making an environment raises
+    """
+
+    def __init__(self, env_fns: Sequence[Callable[[], gym.Env[Any, Any]]], n_workers: int | None = None) -> None:
+        if not env_fns:
+            raise ValueError("env_fns=[] is not accepted; at least one environment is needed")
+        if n_workers is not None and n_workers < 1:
+            raise ValueError(f"n_workers={n_workers} is not accepted; it is at least 1")
+        n_workers = min(n_workers or os.cpu_count() or 1, len(env_fns))
+        bounds = np.linspace(0, len(env_fns), n_workers + 1).astype(int).tolist()
+        self._shares = [range(*pair) for pair in zip(bounds, bounds[1:], strict=False)]
+        self._closed = False
+        self._owing: list[int] = []
+        self._remotes: list[Connection] = []
+        self.processes: list[Any] = []
+        try:
+            self._start([[env_fns[row] for row in share] for share in self._shares])
+            (observation_space, action_space, metadata), *_ = self._ask_all("start", [()] * n_workers)
+            super().__init__(len(env_fns), observation_space, action_space)
+        except BaseException:
+            self.close()
+            raise
+        self.metadata = metadata
+
+    def _start(self, groups: Sequence[Sequence[Callable[[], Any]]]) -> None:
+        forks = "forkserver" in multiprocessing.get_all_start_methods()
+        context: Any = multiprocessing.get_context("forkserver" if forks else "spawn")
+        if forks:
+            # Torch and SB3 are imported once, by the server that all workers are forked from.
+            context.set_forkserver_preload([__name__])
+        for number, group in enumerate(groups):
+            remote, worker_remote = context.Pipe()
+            self._remotes.append(remote)
+            process = context.Process(
+                target=_work, args=(worker_remote, cloudpickle.dumps(list(group))), name=f"worker-{number}", daemon=True
+            )
+            with _main_script_hidden():
+                process.start()
+            self.processes.append(process)
+            worker_remote.close()
+
+    def reset(self) -> VecEnvObs:
+        """Reset every environment, with the seeds and options given since the last reset."""
+        arguments = [
+            ([self._seeds[row] for row in share], [self._options[row] for row in share]) for share in self._shares
+        ]
+        answers = self._ask_all("reset", arguments)
+        self.reset_infos = [info for _, infos in answers for info in infos]
+        self._reset_seeds()
+        self._reset_options()
+        return _joined([observations for observations, _ in answers])
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Send every worker the actions of its environments."""
+        self._collect(discard=True)
+        for worker, share in enumerate(self._shares):
+            self._send(worker, "step", (actions[share.start : share.stop],))
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Wait for all workers."""
+        observations, rewards, dones, sent_infos, sent_reset_infos = zip(*self._collect(), strict=True)
+        infos: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in range(self.num_envs)]
+        for share, some, resets in zip(self._shares, sent_infos, sent_reset_infos, strict=True):
+            for row, info in some.items():
+                infos[share.start + row] = info
+            for row, info in resets.items():
+                self.reset_infos[share.start + row] = info
+        return _joined(observations), np.concatenate(rewards), np.concatenate(dones), infos
+
+    def close(self) -> None:
+        """Close the environments and end the workers, also in the middle of a step or after a worker has died."""
+        if self._closed:
+            return
+        self._closed = True
+        for remote in self._remotes:
+            with contextlib.suppress(OSError):
+                remote.send_bytes(cloudpickle.dumps(("close", ())))
+            # A worker that is still sending an answer is freed by this; nobody will read it.
+            remote.close()
+        for process in self.processes:
+            process.join(_SECONDS_TO_CLOSE)
+            if process.is_alive():
+                process.terminate()
+                process.join()
+
+    def get_images(self) -> Sequence[NDArray[Any] | None]:
+        """Return one picture per environment, ``None`` where the render mode is not ``"rgb_array"``."""
+        return self._in_order("get_images", range(self.num_envs), per_row=False)
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """Return an attribute of the environments asked for."""
+        return self._in_order("get_attr", self._rows(indices), attr_name)
+
+    def has_attr(self, attr_name: str) -> bool:
+        """Return whether every environment has the attribute; its value stays in the workers."""
+        return all(self._ask_all("has_attr", [(attr_name,)] * len(self._shares)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set an attribute of the environments asked for."""
+        self._in_order("set_attr", self._rows(indices), attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
+        """Call a method of the environments asked for; return its results."""
+        return self._in_order("env_method", self._rows(indices), method_name, *args, **kwargs)
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
+    ) -> list[bool]:
+        """Return whether the environments asked for are wrapped in this class."""
+        return self._in_order("env_is_wrapped", self._rows(indices), wrapper_class)
+
+    def _rows(self, indices: VecEnvIndices) -> list[int]:
+        # Python's own indexing gives negative indices their meaning, and refuses those out of range.
+        return [range(self.num_envs)[index] for index in self._get_indices(indices)]
+
+    def _in_order(self, method: str, rows: Sequence[int], *args: Any, per_row: bool = True, **kwargs: Any) -> list[Any]:
+        """Call a method of the workers' ``DummyVecEnv``, return its results in the order of ``rows``."""
+        self._collect(discard=True)
+        asked: list[list[int]] = []
+        for worker, share in enumerate(self._shares):
+            mine = [row for row in rows if row in share]
+            if mine:
+                asked.append(mine)
+                if per_row:
+                    kwargs["indices"] = [row - share.start for row in mine]
+                self._send(worker, method, args, kwargs)
+        answers = self._collect()
+        # A row asked for twice has its results in the order in which they were asked for.
+        results = [iter(answer or [None] * len(mine)) for answer, mine in zip(answers, asked, strict=True)]
+        owner = {row: result for mine, result in zip(asked, results, strict=True) for row in mine}
+        return [next(owner[row]) for row in rows]
+
+    def _ask_all(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+        self._collect(discard=True)
+        for worker, args in enumerate(arguments):
+            self._send(worker, method, args)
+        return self._collect()
+
+    def _send(self, worker: int, method: str, args: tuple[Any, ...], kwargs: dict[str, Any] | None = None) -> None:
+        if self._closed:
+            raise RuntimeError("the environments are closed; make new ones")
+        message = cloudpickle.dumps((method, args, kwargs or {}))
+        try:
+            self._remotes[worker].send_bytes(message)
+        except OSError:
+            raise self._death(worker) from None
+        self._owing.append(worker)
+
+    def _collect(self, discard: bool = False) -> list[Any]:
+        """Receive the answers that are owed; raise the first error among them when all are in.
+
+        :param discard: they are those of a call that was interrupted, and are dropped
+        """
+        answers = []
+        while self._owing:
+            try:
+                answers.append(self._remotes[self._owing[0]].recv())
+            except (EOFError, OSError):
+                raise self._death(self._owing[0]) from None
+            self._owing.pop(0)
+        if discard:
+            return []
+        for kind, value in answers:
+            if kind == _RAISED:
+                error, text = value
+                raise error from RemoteTraceback(text)
+            if kind == _BROKEN:
+                raise RuntimeError(f"an environment failed in its worker:\n{value}")
+        return [value for _, value in answers]
+
+    def _death(self, worker: int) -> RuntimeError:
+        """Close everything and return the error that says which worker has died."""
+        process, share = self.processes[worker], self._shares[worker]
+        process.join(_SECONDS_TO_CLOSE)
+        self._owing.clear()
+        self.close()
+        return RuntimeError(
+            f"worker {worker}, which ran environments {share.start} to {share.stop - 1}, has died with exit code "
+            f"{process.exitcode}; the environments are closed"
+        )
+
+
+class _Group:
+    """The environments of one worker.
+
+    :param env_fns: make one environment each
+    """
+
+    def __init__(self, env_fns: Sequence[Callable[[], Any]]) -> None:
+        self.venv = DummyVecEnv(list(env_fns))
+
+    def start(self) -> tuple[Any, Any, Any]:
+        """Return what the main process has to know."""
+        return self.venv.observation_space, self.venv.action_space, self.venv.metadata
+
+    def reset(self, seeds: list[int | None], options: list[dict[str, Any]]) -> tuple[VecEnvObs, list[dict[str, Any]]]:
+        """Reset with seeds and options, one for each environment."""
+        self.venv._seeds, self.venv._options = seeds, options
+        return self.venv.reset(), self.venv.reset_infos
+
+    def step(self, actions: NDArray[Any]) -> tuple[Any, ...]:
+        """Step; return infos and reset infos by row, only where they say something new."""
+        observations, rewards, dones, infos = self.venv.step(actions)
+        # DummyVecEnv puts "TimeLimit.truncated" into every info; alone and False it says nothing.
+        some = {row: info for row, info in enumerate(infos) if len(info) > 1 or info["TimeLimit.truncated"]}
+        resets = {row: self.venv.reset_infos[row] for row in np.flatnonzero(dones).tolist()}
+        return observations, rewards, dones, some, resets
+
+    def has_attr(self, name: str) -> bool:
+        """Return whether every environment has the attribute."""
+        return self.venv.has_attr(name)
+
+    def get_images(self) -> list[Any]:
+        """Return one picture per environment."""
+        return list(self.venv.get_images())
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.venv, name)
+
+
+def _work(remote: Connection, pickled_env_fns: bytes) -> None:
+    """Answer the main process until it closes the connection."""
+    # Ctrl-C reaches all processes of a terminal; the main one decides what becomes of it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    group: _Group | None = None
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            message = remote.recv_bytes()
+            try:
+                method, args, *kwargs = cloudpickle.loads(message)
+                if method == "close":
+                    break
+                if group is None:
+                    group = _Group(cloudpickle.loads(pickled_env_fns))
+                answer = cloudpickle.dumps((_OK, getattr(group, method)(*args, **kwargs[0])))
+            except Exception as error:
+                answer = _pickled_error(error)
+            remote.send_bytes(answer)
+    if group is not None:
+        group.venv.close()
+    remote.close()
+
+
+def _pickled_error(error: Exception) -> bytes:
+    text = traceback.format_exc()
+    try:
+        pickled = cloudpickle.dumps((_RAISED, (error, text)))
+        cloudpickle.loads(pickled)  # an error with a constructor of its own may be pickled and then not be made again
+    except Exception:
+        return cloudpickle.dumps((_BROKEN, text))
+    return pickled
+
+
+@contextlib.contextmanager
+def _main_script_hidden() -> Iterator[None]:
+    """Start a process that does not import the calling script, which it would do only to unpickle what we send."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
+
+
+def _joined(parts: Sequence[Any]) -> Any:
+    """Return the workers' observations as one batch: arrays, or a dict or tuple of arrays."""
+    first = parts[0]
+    if isinstance(first, dict):
+        return type(first)((key, np.concatenate([part[key] for part in parts])) for key in first)
+    if isinstance(first, tuple):
+        return tuple(np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return np.concatenate(parts)

@@ -1,0 +1,312 @@
+"""Environments grouped in worker processes against the same environments in one process."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from copy import deepcopy
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, is_vecenv_wrapped
+
+from sb3_progpolicy import vec_env
+from sb3_progpolicy.grouped import GroupedSubprocVecEnv, RemoteTraceback
+from sb3_progpolicy.vec_env import make_fast_vec_env
+
+N_ENVS = 5
+PLACES = {
+    "array": spaces.Box(0, 1, (2,), np.float64),
+    "dict": spaces.Dict({"near": spaces.Box(0, 1, (2,), np.float32), "far": spaces.Discrete(9)}),
+    "tuple": spaces.Tuple((spaces.Box(0, 1, (1, 2), np.float32), spaces.Discrete(3))),
+}
+
+
+class Locked(Exception):
+    """Is pickled with one argument and needs two."""
+
+    def __init__(self, one, two):
+        super().__init__(f"{one} and {two}")
+
+
+class Countdown(gym.Env):
+    """Ends after a number of steps that its options say, and tells more in some infos than in others."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 3}
+
+    def __init__(self, place="array", render_mode=None):
+        self.observation_space, self.action_space = deepcopy(PLACES[place]), spaces.Discrete(4)
+        self.render_mode, self.start, self.closed_file = render_mode, 5, None
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.start = (options or {}).get("start", self.start)
+        if self.start < 0:
+            raise ValueError(f"start={self.start} is not accepted")
+        self.left = self.start
+        self.observation_space.seed(int(self.np_random.integers(2**31)))
+        return self.observation_space.sample(), {"start": self.start}
+
+    def step(self, action):
+        if action == 3:
+            os._exit(7)
+        self.left -= 1
+        info = {"action": np.array([action])} if action == 2 else {}
+        reward = self.np_random.normal()
+        return self.observation_space.sample(), reward, self.left == 0 and action == 1, self.left <= 0, info
+
+    def render(self):
+        return np.full((4, 6, 3), self.start, dtype=np.uint8)
+
+    def fail(self):
+        raise Locked("a", "b")
+
+    def name_closing(self, path):
+        self.closed_file = path
+
+    def close(self):
+        if self.closed_file is not None:
+            Path(self.closed_file).touch()
+
+
+class Marked(gym.Wrapper):
+    """Has nothing to add."""
+
+
+def functions(n_envs=N_ENVS, **kwargs):
+    return [
+        lambda row=row: Monitor(Marked(Countdown(**kwargs)) if row % 2 else Countdown(**kwargs))
+        for row in range(n_envs)
+    ]
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """Five environments in two workers and five in this process."""
+    envs = GroupedSubprocVecEnv(functions(render_mode="rgb_array"), 2), DummyVecEnv(functions(render_mode="rgb_array"))
+    yield envs
+    for env in envs:
+        env.close()
+
+
+def without_time(infos):
+    return [{**info, "episode": {**info["episode"], "t": 0}} if "episode" in info else info for info in infos]
+
+
+def assert_equal_runs(grouped, single, n_steps):
+    ends = {True: 0, False: 0}
+    rng = np.random.default_rng(0)
+    for round_ in range(2):
+        for env in (grouped, single):
+            env.seed(7 + round_)
+            env.set_options([{"start": 1 + (row + round_) % 4} if row else {} for row in range(N_ENVS)])
+        np.testing.assert_equal(grouped.reset(), single.reset())
+        assert grouped.reset_infos == single.reset_infos
+        for _ in range(n_steps):
+            actions = rng.integers(3, size=N_ENVS)
+            (obs_a, rewards_a, dones_a, infos_a), (obs_b, rewards_b, dones_b, infos_b) = (
+                env.step(actions) for env in (grouped, single)
+            )
+            assert type(obs_a) is type(obs_b)
+            np.testing.assert_equal(obs_a, obs_b)
+            for a, b in ((rewards_a, rewards_b), (dones_a, dones_b)):
+                assert a.dtype == b.dtype
+                np.testing.assert_array_equal(a, b)
+            np.testing.assert_equal(without_time(infos_a), without_time(infos_b))
+            assert grouped.reset_infos == single.reset_infos
+            for row in np.flatnonzero(dones_a):
+                ends[infos_a[row]["TimeLimit.truncated"]] += 1
+    assert min(ends.values()) > 0, "episodes of both ends are compared"
+
+
+def test_equals_dummy_vec_env_step_for_step(pair):
+    assert_equal_runs(*pair, n_steps=50)
+
+
+@pytest.mark.parametrize("place", ["dict", "tuple"])
+def test_equals_dummy_vec_env_with_other_observation_spaces(place):
+    grouped, single = GroupedSubprocVecEnv(functions(place=place), 3), DummyVecEnv(functions(place=place))
+    try:
+        assert_equal_runs(grouped, single, n_steps=10)
+    finally:
+        grouped.close()
+
+
+@pytest.mark.parametrize("indices", [None, 3, [4, 0, 2], [-1, 1, 1]])
+def test_attributes_and_methods_reach_the_environments_asked_for(pair, indices):
+    for env in pair:
+        env.set_options([{"start": row + 10} for row in range(N_ENVS)])
+        env.reset()
+    grouped, single = pair
+    for env in pair:
+        env.env_method("set_wrapper_attr", "mark", 5, force=True, indices=indices)
+        env.set_attr("note", "seen", indices)
+    assert grouped.get_attr("start", indices) == single.get_attr("start", indices)
+    chosen = single._get_indices(indices)
+    assert grouped.get_attr("note", indices) == ["seen"] * len(list(chosen))
+    assert grouped.env_is_wrapped(Marked, indices) == single.env_is_wrapped(Marked, indices)
+    assert grouped.env_is_wrapped(Monitor, indices) == single.env_is_wrapped(Monitor, indices)
+
+
+def test_attribute_is_there_only_if_every_environment_has_it(pair):
+    grouped, _ = pair
+    grouped.set_attr("only_here", 1, indices=[0])
+    assert (grouped.has_attr("start"), grouped.has_attr("only_here")) == (True, False)
+
+
+def test_pictures_are_tiled_as_by_dummy_vec_env(pair):
+    grouped, single = pair
+    for env in pair:
+        env.set_options([{"start": row + 10} for row in range(N_ENVS)])
+        env.reset()
+    np.testing.assert_array_equal(grouped.get_images(), single.get_images())
+    np.testing.assert_array_equal(grouped.render(), single.render())
+    assert (grouped.render_mode, grouped.metadata) == (single.render_mode, single.metadata)
+
+
+def test_an_error_in_an_environment_is_raised_here_and_leaves_the_workers_in_use(pair):
+    grouped, _ = pair
+    grouped.set_options([{"start": 1 if row != 4 else -3} for row in range(N_ENVS)])
+    with pytest.raises(ValueError, match="start=-3 is not accepted") as caught:
+        grouped.reset()
+    assert isinstance(caught.value.__cause__, RemoteTraceback)
+    assert "in reset" in str(caught.value.__cause__)
+    grouped.set_options({"start": 3})
+    assert len(grouped.reset()) == N_ENVS
+    assert [info["start"] for info in grouped.reset_infos] == [3] * N_ENVS
+
+
+def test_an_error_that_cannot_travel_is_told_in_words(pair):
+    with pytest.raises(RuntimeError, match="failed in its worker") as caught:
+        pair[0].env_method("fail", indices=[0])
+    assert "Locked: a and b" in str(caught.value)
+
+
+def test_the_answer_to_an_interrupted_step_is_dropped(pair):
+    grouped, single = pair
+    for env in pair:
+        env.seed(0)
+        env.set_options({"start": 4})
+        env.reset()
+    grouped.step_async(np.zeros(N_ENVS, dtype=int))
+    assert grouped.get_attr("left") == [3] * N_ENVS
+    single.step(np.zeros(N_ENVS, dtype=int))
+    np.testing.assert_equal(grouped.step([0] * N_ENVS)[0], single.step([0] * N_ENVS)[0])
+
+
+def test_a_worker_that_dies_is_named_and_everything_is_closed():
+    env = GroupedSubprocVecEnv(functions(), 2)
+    env.reset()
+    with pytest.raises(RuntimeError, match=r"worker 1, which ran environments 2 to 4, has died with exit code 7"):
+        env.step(np.array([0, 0, 0, 0, 3]))
+    assert [process.is_alive() for process in env.processes] == [False, False]
+    with pytest.raises(RuntimeError, match="closed; make new ones"):
+        env.reset()
+    env.close()
+
+
+def test_close_closes_the_environments_and_ends_the_workers_also_during_a_step(tmp_path):
+    env = GroupedSubprocVecEnv(functions(), 2)
+    env.reset()
+    for row in range(N_ENVS):
+        env.env_method("name_closing", tmp_path / str(row), indices=row)
+    env.step_async(np.zeros(N_ENVS, dtype=int))
+    env.close()
+    assert [process.exitcode for process in env.processes] == [0, 0]
+    assert len(list(tmp_path.iterdir())) == N_ENVS
+
+
+SCRIPT = """
+import gymnasium as gym, numpy as np, os, signal, sys
+from sb3_progpolicy.grouped import GroupedSubprocVecEnv
+
+class Mine(gym.Wrapper):
+    pass
+
+# No __main__ guard: the workers must not run this script.
+env = GroupedSubprocVecEnv([lambda: Mine(gym.make("CartPole-v1")) for _ in range(4)], 2)
+env.reset()
+print(*(process.pid for process in env.processes), *env.env_is_wrapped(Mine), flush=True)
+try:
+    while True:
+        env.step(np.zeros(4, dtype=int))
+except KeyboardInterrupt:
+    env.close()
+    print("closed", flush=True)
+"""
+
+
+def test_ctrl_c_reaches_the_script_and_not_the_workers(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.Popen(
+        [sys.executable, str(script)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        start_new_session=True,
+    )
+    line = process.stdout.readline().split()
+    assert line[2:] == ["True"] * 4
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    assert (process.returncode, out, err) == (0, "closed\n", "")
+    deadline = time.monotonic() + 10
+    while any(Path("/proc", pid).exists() for pid in line[:2]) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not any(Path("/proc", pid).exists() for pid in line[:2])
+
+
+@pytest.mark.parametrize(("n_envs", "n_workers", "said"), [(0, 1, "at least one environment"), (2, 0, "n_workers=0")])
+def test_no_environment_and_no_worker_are_refused(n_envs, n_workers, said):
+    with pytest.raises(ValueError, match=said):
+        GroupedSubprocVecEnv(functions(n_envs), n_workers)
+
+
+def test_an_environment_that_cannot_be_made_says_so_here():
+    with pytest.raises(gym.error.NameNotFound):
+        GroupedSubprocVecEnv([lambda: gym.make("Nowhere-v0")] * 2, 2)
+
+
+def test_no_more_workers_than_environments_and_even_shares():
+    env = GroupedSubprocVecEnv(functions(3), 8)
+    assert len(env.processes) == 3
+    env.close()
+
+
+def test_simulations_are_grouped_and_equal_single_ones(monkeypatch):
+    monkeypatch.setattr(vec_env.os, "cpu_count", lambda: 2)
+    options = [{"n_targets": n} for n in (1, 2, 3)]
+    grouped, single = make_fast_vec_env("PandaReach-v0", 3, seed=5), make_vec_env("PandaReach-v0", 3, seed=5)
+    try:
+        assert isinstance(grouped, GroupedSubprocVecEnv)
+        assert len(grouped.processes) == 2
+        assert grouped.env_is_wrapped(Monitor) == [True] * 3
+        for env in (grouped, single):
+            env.set_options(options)
+        np.testing.assert_array_equal(grouped.reset(), single.reset())
+        rng = np.random.default_rng(0)
+        for _ in range(20):
+            actions = rng.uniform(-1, 1, (3, 4)).astype(np.float32)
+            a, b = grouped.step(actions), single.step(actions)
+            np.testing.assert_equal((*a[:3], without_time(a[3])), (*b[:3], without_time(b[3])))
+    finally:
+        grouped.close()
+        single.close()
+
+
+@pytest.mark.parametrize(("env_id", "n_envs", "cores"), [("PandaReach-v0", 1, 8), ("PandaReach-v0", 2, 1)])
+def test_one_simulation_or_one_core_needs_no_process(monkeypatch, env_id, n_envs, cores):
+    monkeypatch.setattr(vec_env.os, "cpu_count", lambda: cores)
+    env = make_fast_vec_env(env_id, n_envs)
+    assert isinstance(env, DummyVecEnv)
+    assert not is_vecenv_wrapped(env, GroupedSubprocVecEnv)
+    env.close()
