@@ -257,3 +257,21 @@ def test_same_actions_give_the_same_trajectory() -> None:
         return [env.step(int(action))[0] for action in np.random.default_rng(1).integers(6, size=100)]
 
     np.testing.assert_array_equal(trajectory(), trajectory())
+
+
+def situations(n_discs: int, source: int, target: int) -> set[tuple[bytes, int | None]]:
+    """What can be seen on the shortest solution: each observation with the move before it."""
+    env, seen, previous = HanoiEnv(n_discs, source, target), set(), None
+    observation, _ = env.reset()
+    for move in planner.plan([source] * n_discs, target):
+        seen.add((observation.tobytes(), previous))
+        previous = MOVES.index(move)
+        observation, *_ = env.step(previous)
+    return seen
+
+
+def test_small_towers_show_every_situation_of_larger_ones_only_when_the_pegs_are_drawn() -> None:
+    tested = set().union(*(situations(n, 0, 2) for n in range(1, 11)))
+    fixed = set().union(*(situations(n, 0, 2) for n in range(1, 5)))
+    drawn = set().union(*(situations(n, *pegs) for n in range(1, 5) for pegs in permutations(range(3), 2)))
+    assert (len(tested), len(tested - fixed), len(tested - drawn)) == (38, 18, 0)
