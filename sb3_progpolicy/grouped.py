@@ -9,6 +9,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from multiprocessing.connection import Connection
 from types import ModuleType
 from typing import Any
@@ -57,7 +58,7 @@ class GroupedSubprocVecEnv(VecEnv):
             raise ValueError(f"n_workers={n_workers} is not accepted; it is at least 1")
         n_workers = min(n_workers or os.cpu_count() or 1, len(env_fns))
         bounds = np.linspace(0, len(env_fns), n_workers + 1).astype(int).tolist()
-        self._shares = [range(*pair) for pair in zip(bounds, bounds[1:], strict=False)]
+        self._shares = [range(*pair) for pair in pairwise(bounds)]
         self._closed = False
         self._owing: list[int] = []
         self._remotes: list[Connection] = []
