@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Any
@@ -35,8 +34,7 @@ def play(
         _check_playable(env_id)
         game = gym.make(env_id, render_mode="ansi")
     try:
-        with contextlib.closing(_pressed()) as pressed:
-            _play(game, variations[0], seed, pressed)
+        _play(game, variations[0], seed, _pressed())
     finally:
         game.close()
 
