@@ -13,7 +13,7 @@ help:
 	@echo "make demo     train on 1-4 discs, print the program and a table for 1-8 discs"
 	@echo "make test     run the tests"
 	@echo "make lint     ruff and mypy;  make format  applies ruff's fixes"
-	@echo "make bench    measure speed against Stable-Baselines3's own algorithms"
+	@echo "make bench    measure speed: training against Stable-Baselines3, environments batched and in processes"
 	@echo "make docs     build the documentation into docs/_build/html"
 	@echo "make install  install into $(VENV); the other targets do so by themselves"
 
@@ -43,6 +43,8 @@ format: $(INSTALLED)
 bench: $(INSTALLED)
 	$(ONE_THREAD) $(BIN)/python benchmarks/training_speed.py
 	$(ONE_THREAD) $(BIN)/python benchmarks/recurrence.py
+	$(ONE_THREAD) $(BIN)/python benchmarks/envs_speed.py
+	$(ONE_THREAD) $(BIN)/python benchmarks/vec_env_speed.py
 
 docs: $(INSTALLED)
 	$(BIN)/python -m sphinx -W --keep-going -q docs docs/_build/html

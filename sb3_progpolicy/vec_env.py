@@ -126,5 +126,6 @@ def make_fast_vec_env(env_id: str, n_envs: int, seed: int | None = None, **env_k
         batch.close()
     domain = DOMAINS.get(env_id.rpartition(":")[2])
     grouped = domain is not None and domain.simulation and min(n_envs, os.cpu_count() or 1) > 1
-    vec_env_cls = GroupedSubprocVecEnv if grouped else DummyVecEnv
+    # SB3 names its own two classes here and takes any other.
+    vec_env_cls: Any = GroupedSubprocVecEnv if grouped else DummyVecEnv
     return make_vec_env(env_id, n_envs=n_envs, seed=seed, env_kwargs=env_kwargs, vec_env_cls=vec_env_cls)

@@ -1,4 +1,4 @@
-"""The command line: train, evaluate, show, render, envs. Each command imports what it needs when it runs."""
+"""The command line: train, evaluate, show, render, play, envs. Each command imports what it needs when it runs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import typer
 
-from sb3_progpolicy.cli import evaluating, rendering, showing, training
+from sb3_progpolicy.cli import evaluating, playing, rendering, showing, training
 from sb3_progpolicy.cli.parsing import repeat_flags
 from sb3_progpolicy.nearest import unknown
 
@@ -23,6 +23,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "evaluate": evaluating.evaluate,
     "show": showing.show,
     "render": rendering.render,
+    "play": playing.play,
     "envs": showing.envs,
 }
 for _name, _command in COMMANDS.items():

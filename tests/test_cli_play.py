@@ -1,0 +1,138 @@
+"""``progpolicy play`` with piped and typed keys, and ``progpolicy render --planner`` and ``envs`` for every domain."""
+
+import contextlib
+import io
+import os
+import subprocess
+import sys
+
+import pytest
+from PIL import Image
+
+from progpolicy_envs import DOMAINS
+from sb3_progpolicy.cli import run
+from sb3_progpolicy.cli.playing import action_keys
+
+PLANNING = [domain.id for domain in DOMAINS.values() if not domain.simulation]
+SIMULATIONS = [domain.id for domain in DOMAINS.values() if domain.simulation]
+
+
+@pytest.fixture
+def play(monkeypatch, capsys):
+    def played(keys, *arguments):
+        monkeypatch.setattr(sys, "stdin", io.StringIO(keys))
+        code = run(["play", *arguments])
+        return code, *capsys.readouterr()
+
+    return played
+
+
+def test_hanoi_is_solved_by_typed_keys_and_every_state_is_shown(play):
+    # Two discs from peg 0 to peg 2: 0->1, 0->2, 1->2.
+    code, out, _ = play("12\n 4", "Hanoi-v0", "--set", "n_discs=2")
+    assert code == 0
+    assert out.startswith("1 move 0->1   2 move 0->2   3 move 1->0   4 move 1->2   5 move 2->0   6 move 2->1   q quit")
+    assert out.count("0 source --1-- 2 target") == 4
+    assert "2: move 0->2, reward -0.01" in out
+    assert "Goal reached in 3 steps; the planner needs 3. Return" in out.splitlines()[-1]
+
+
+def test_quit_and_end_of_input_stop_and_unknown_keys_are_answered(play):
+    code, out, _ = play("1x1q222", "Hanoi-v0")
+    assert code == 0
+    assert "'x' is not a key; keys: 1 2 3 4 5 6 q" in out
+    assert out.endswith("Stopped after 2 steps; the planner needs 7 in all.\n")
+    assert play("1", "Hanoi-v0")[1].endswith("Stopped after 1 steps; the planner needs 7 in all.\n")
+
+
+@pytest.mark.parametrize("env_id", PLANNING)
+def test_every_planning_domain_shows_all_its_actions_and_takes_all_keys(play, env_id):
+    number_of_keys = {"Hanoi-v0": 6, "Hiking-v0": 4, "Stacking-v0": 5}[env_id]
+    _, out, _ = play("", env_id, "--seed", "1")
+    keys = [entry.split()[0] for entry in out.splitlines()[0].split("   ")]
+    assert len(set(keys)) == number_of_keys + 1
+    _, out, _ = play("".join(keys), env_id, "--seed", "1", "--set", f"{DOMAINS[env_id].size}=4")
+    assert f"\n{number_of_keys}: " in out
+
+
+def test_equal_seeds_give_equal_games(play):
+    games = [play("nesw", "Hiking-v0", "--seed", seed)[1] for seed in ("1", "1", "2")]
+    assert games[0] == games[1] != games[2]
+
+
+def test_actions_without_an_initial_of_their_own_are_numbered():
+    assert action_keys(["north", "pick", "move 0->1"]) == {"n": 0, "p": 1, "3": 2}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["PandaReach-v0"], "can be played in a terminal: Hanoi-v0"),
+        (["CartPole-v1"], "can be played in a terminal: Hanoi-v0"),
+        (["Hanoy-v0"], "Hanoi-v0"),
+        (["Hanoi-v0", "--set", "n_discs=1,2"], "2 variations"),
+        (["Hanoi-v0", "--set", "n_discs=77"], "n_discs=77"),
+    ],
+)
+def test_what_cannot_be_played_is_refused(play, arguments, said):
+    code, out, err = play("q", *arguments)
+    assert (code, out) == (2, "")
+    assert said in err
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="no pseudo-terminals on this system")
+def test_in_a_terminal_single_keys_are_enough():
+    ours, theirs = os.openpty()
+    command = [sys.executable, "-c", "from sb3_progpolicy.cli import main; main()", "play", "Hanoi-v0"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.Popen(command, stdin=theirs, stdout=subprocess.PIPE, text=True, env=environment)
+    try:
+        # What is typed before a key is waited for is thrown away; so it is typed until it has been taken.
+        for _ in range(300):
+            os.write(ours, b"Q")
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(timeout=0.2)
+                break
+        assert process.returncode == 0
+        assert process.stdout.read().endswith("Stopped after 0 steps; the planner needs 7 in all.\n")
+    finally:
+        process.kill()
+        process.communicate()
+        os.close(ours)
+        os.close(theirs)
+
+
+@pytest.mark.parametrize("env_id", PLANNING)
+def test_the_planner_of_every_planning_domain_is_rendered_to_its_goal(tmp_path, capsys, env_id):
+    file = tmp_path / "planner.gif"
+    assert run(["render", env_id, "--planner", "-o", str(file), "--set", f"{DOMAINS[env_id].size}=3"]) == 0
+    message = capsys.readouterr().err
+    assert "goal reached" in message
+    with Image.open(file) as picture:
+        assert f"{picture.n_frames - 1} steps" in message
+
+
+@pytest.mark.parametrize(("actor", "cap"), [("--planner", "30"), ("--random", "3")])
+def test_panda_is_rendered(tmp_path, capsys, actor, cap):
+    file = tmp_path / "panda.gif"
+    assert run(["render", "PandaReach-v0", actor, "-o", str(file), "--set", "n_targets=1", "--max-steps", cap]) == 0
+    assert ("goal reached" in capsys.readouterr().err) == (actor == "--planner")
+    assert file.stat().st_size > 1000
+
+
+def test_the_planner_of_another_environment_is_refused(tmp_path, capsys):
+    assert run(["render", "CartPole-v1", "--planner", "-o", str(tmp_path / "a.gif"), "--set", "a=1"]) == 2
+    assert "--planner is not accepted for CartPole-v1" in capsys.readouterr().err
+
+
+def test_the_table_of_environments_lists_every_domain_with_ranges_and_both_sets(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
+    assert run(["envs"]) == 0
+    out = capsys.readouterr().out
+    rows = {domain: [line for line in out.split("├") if domain in line] for domain in DOMAINS}
+    for domain in DOMAINS.values():
+        (row,) = rows[domain.id]
+        for part in (domain.train, domain.unseen):
+            sizes = ", ".join(dict.fromkeys(str(variation[domain.size]) for variation in part))
+            assert f"{domain.size}: {sizes}" in row
+        assert row.count(f"{domain.size}: ") == 3, "the range, what is trained on, what is unseen"
