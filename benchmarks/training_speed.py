@@ -31,8 +31,8 @@ ENV, TASK = "Hanoi-v0", {"n_discs": 3}
 N_ENVS, N_STEPS = 32, 128
 COMMON: dict[str, Any] = {"n_steps": N_STEPS, "n_epochs": 4, "batch_size": 2048, "seed": 0, "device": "cpu"}
 
-# ReptilePPO("ProgPolicy") in its phases: while W is searched for, all conditions are computed and every second update moves
-# W alone; after that phi is trained, with the conditions of the extracted program.
+# ReptilePPO("ProgPolicy") in its phases: while W is searched for, all conditions are computed and every second update
+# moves W alone; after that phi is trained, with the conditions of the extracted program.
 OURS: dict[str, Callable[[], OnPolicyAlgorithm]] = {
     "ours, searching": lambda: _ours(),
     "ours, 2 conditions": lambda: _ours(n_conditions=2),
