@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -16,7 +17,7 @@ Result = TypeVar("Result")
 CELL_NAMES = {"affine": "affine", "rnn": "RNN", "gru": "GRU", "lstm": "LSTM"}
 
 
-class ProgramVisitor(Generic[Result]):
+class ProgramVisitor(ABC, Generic[Result]):
     """One output format: a method for each kind of node.
 
     :param program: what is printed
@@ -33,13 +34,13 @@ class ProgramVisitor(Generic[Result]):
             return self.visit_branch(expression, index)
         return self.visit_controller(expression, index)
 
+    @abstractmethod
     def visit_branch(self, branch: IfThenElse, index: int) -> Result:
         """Print ``if B then C else E``."""
-        raise NotImplementedError
 
+    @abstractmethod
     def visit_controller(self, controller: Controller, index: int) -> Result:
         """Print ``c + T·X``."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
