@@ -232,8 +232,8 @@ class Mine(gym.Wrapper):
 # No __main__ guard: the workers must not run this script.
 env = GroupedSubprocVecEnv([lambda: Mine(gym.make("CartPole-v1")) for _ in range(4)], 2)
 env.reset()
-print(*(process.pid for process in env.processes), *env.env_is_wrapped(Mine), flush=True)
 try:
+    print(*(process.pid for process in env.processes), *env.env_is_wrapped(Mine), flush=True)
     while True:
         env.step(np.zeros(4, dtype=int))
 except KeyboardInterrupt:
