@@ -153,7 +153,7 @@ class VecInteractionHistory(VecEnvWrapper):
             axis=1,
             dtype=np.float32,
         )
-        for row in np.flatnonzero(dones):
+        for row in dones.nonzero()[0]:
             info = infos[row]
             if "terminal_observation" in info:
                 # A truncated episode could have gone on: its value is that of a state that is not the end.

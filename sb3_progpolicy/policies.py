@@ -9,7 +9,12 @@ import torch as th
 from gymnasium import spaces
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from sb3_contrib.common.recurrent.type_aliases import RNNStates
-from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
+from stable_baselines3.common.distributions import (
+    CategoricalDistribution,
+    DiagGaussianDistribution,
+    Distribution,
+    MultiCategoricalDistribution,
+)
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.common.type_aliases import Schedule
@@ -22,6 +27,22 @@ from sb3_progpolicy.programs.syntax import ActionSpec, Cell, Program
 
 # W is one number per layer and has few updates to decide in, so that it takes larger steps than the controllers.
 DERIVATION_LR_SCALE = 10.0
+
+
+class NormalizedCategorical(th.distributions.Categorical):
+    """A categorical distribution from log-probabilities whose exponentials sum to 1 already.
+
+    Torch's own normalises them again, twice, which took as long as mixing them.
+
+    :param log_probs: ``(..., n_choices)``
+    """
+
+    def __init__(self, log_probs: th.Tensor) -> None:
+        self.logits = log_probs
+        self.probs = log_probs.exp()
+        self._param = self.logits
+        self._num_events = log_probs.shape[-1]
+        th.distributions.Distribution.__init__(self, log_probs.shape[:-1], validate_args=False)
 
 
 class ProgrammaticActorCritic(ActorCriticPolicy):
@@ -179,22 +200,48 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
 
     def _distribution(self, features: th.Tensor, tests: th.Tensor) -> Distribution:
         """Return the action distribution of the soft semantics."""
-        parameters = self.module.mix(features, self.module.masses(tests))
-        if isinstance(self.action_dist, DiagGaussianDistribution):
-            return self.action_dist.proba_distribution(parameters, self.log_std)
-        return self.action_dist.proba_distribution(action_logits=parameters)
+        return self._distribution_of(self.module.mix(features, self.module.masses(tests)))
 
-    def evaluate_derivation(
-        self, obs: th.Tensor, tests: th.Tensor, actions: th.Tensor
-    ) -> tuple[th.Tensor, th.Tensor | None]:
-        """Return log-probabilities and entropies for conditions whose values are known, as when only W is moved.
+    def _distribution_of(self, parameters: th.Tensor) -> Distribution:
+        """Return the distribution with these parameters, ``(n, n_outputs)`` (see ``ProgramModule.mix``)."""
+        distribution = self.action_dist
+        if isinstance(distribution, DiagGaussianDistribution):
+            return distribution.proba_distribution(parameters, self.log_std)
+        if isinstance(distribution, CategoricalDistribution):
+            distribution.distribution = NormalizedCategorical(parameters)
+        elif isinstance(distribution, MultiCategoricalDistribution):
+            components = parameters.split(list(self.spec_of_actions.sizes), dim=1)
+            distribution.distribution = [NormalizedCategorical(component) for component in components]
+        else:
+            distribution.proba_distribution(action_logits=parameters)
+        return distribution
+
+    def derivation_terms(self, obs: th.Tensor, tests: th.Tensor) -> th.Tensor:
+        """Return what :meth:`evaluate_derivation` needs, which stays the same while only W is moved.
 
         :param obs: ``(n, n_inputs)``
-        :param tests: the values of B, ``(n, depth - 1)``, from :meth:`condition_values`
+        :param tests: the values of B, ``(n, depth - 1)``
+        """
+        return self.module.derivation_terms(self._split_features(obs)[0], tests)
+
+    def evaluate_derivation(self, terms: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor | None]:
+        """Return log-probabilities and entropies.
+
+        :param terms: from :meth:`derivation_terms`, ``(n, ...)``
         :param actions: ``(n,)`` or ``(n, ...)``
         """
-        distribution = self._distribution(self._split_features(obs)[0], tests)
+        distribution = self._distribution_of(self.module.mix_derivation(terms))
         return distribution.log_prob(actions), distribution.entropy()
+
+    def evaluate_tests(self, obs: th.Tensor, tests: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Return values and log-probabilities for conditions whose values are known.
+
+        :param obs: ``(n, n_inputs)``
+        :param tests: the values of B, ``(n, depth - 1)``
+        :param actions: ``(n,)`` or ``(n, ...)``
+        """
+        features, critic_features = self._split_features(obs)
+        return self._values(critic_features), self._distribution(features, tests).log_prob(actions)
 
     def condition_values(self, obs: th.Tensor, states: tuple[th.Tensor, ...] | None = None) -> th.Tensor:
         """Return the value of B of every condition, ``(n, depth - 1)``.
@@ -308,13 +355,13 @@ class ProgrammaticPolicy(ProgrammaticActorCritic):
             )
         super().__init__(*args, **kwargs)
 
-    def _distribution_of(self, features: th.Tensor) -> Distribution:
+    def _distribution_at(self, features: th.Tensor) -> Distribution:
         return self._distribution(features, self.module.conditions(features, self.module.initial_state(1))[0])
 
     def forward(self, obs: th.Tensor, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """Return actions, values and log-probabilities. See ``ActorCriticPolicy.forward``."""
         pi_features, vf_features = self._split_features(obs)
-        distribution = self._distribution_of(pi_features)
+        distribution = self._distribution_at(pi_features)
         actions = distribution.get_actions(deterministic=deterministic)
         log_prob = distribution.log_prob(actions)
         actions = actions.reshape((-1, *self.action_space.shape))  # type: ignore[misc]
@@ -322,7 +369,7 @@ class ProgrammaticPolicy(ProgrammaticActorCritic):
 
     def get_distribution(self, obs: th.Tensor) -> Distribution:  # type: ignore[override]
         """Return the action distribution. See ``ActorCriticPolicy.get_distribution``."""
-        return self._distribution_of(self._split_features(obs)[0])
+        return self._distribution_at(self._split_features(obs)[0])
 
     def predict_values(self, obs: th.Tensor) -> th.Tensor:  # type: ignore[override]
         """Return the values ``(n, 1)``."""
@@ -333,5 +380,5 @@ class ProgrammaticPolicy(ProgrammaticActorCritic):
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
         """Return values, log-probabilities and entropies. See ``ActorCriticPolicy.evaluate_actions``."""
         pi_features, vf_features = self._split_features(obs)
-        distribution = self._distribution_of(pi_features)
+        distribution = self._distribution_at(pi_features)
         return self._values(vf_features), distribution.log_prob(actions), distribution.entropy()

@@ -285,13 +285,12 @@ class ReptilePPO(PPO):
         callback.on_rollout_start()
         if self.temperature is not None and isinstance(self.policy, ProgrammaticActorCritic):
             self.policy.set_temperature(FloatSchedule(self.temperature)(self._current_progress_remaining))
-        self._sampler = self._make_sampler()
+        self._sampler = self._make_sampler(n_rollout_steps)
         # States at which the sequences of the update start.
         self._sequence_states: list[RNNStates] = []
         for step in range(n_rollout_steps):
             if self.recurrent and step % self.sequence_length == 0:
-                assert self._last_lstm_states is not None
-                self._sequence_states.append(self._last_lstm_states)
+                self._sequence_states.append(self._present_states())
             actions = self._act(rollout_buffer, step)
             env_actions = actions
             if isinstance(self.action_space, spaces.Box):
@@ -318,28 +317,28 @@ class ReptilePPO(PPO):
         callback.on_rollout_end()
         return True
 
-    def _make_sampler(self) -> ProgramSampler | None:
+    def _make_sampler(self, n_steps: int) -> ProgramSampler | None:
         """Return the fast way to draw actions, where there is one: a program on the CPU that reads flat numbers."""
         policy = self.policy
         if not isinstance(policy, ProgrammaticActorCritic) or self.device.type != "cpu":
             return None
         if type(policy.features_extractor) not in (FlattenExtractor, NormalizingExtractor):
             return None
-        return ProgramSampler(policy.module, getattr(policy, "log_std", None))
+        states = self._last_lstm_states
+        state = policy.module.initial_state(self.n_envs) if states is None else cast(State, states.pi)
+        return ProgramSampler(policy.module, state, n_steps, self.reptile.rng, getattr(policy, "log_std", None))
 
-    @th.no_grad()
     def _act(self, buffer: RolloutBuffer, step: int) -> np.ndarray:
         """Draw actions ``(n_envs, *action_shape)`` and advance the recurrent states."""
-        if self._sampler is not None:
-            features = np.asarray(self._last_obs, dtype=np.float32)
-            if isinstance(self.policy.features_extractor, NormalizingExtractor):
-                features = self.policy.features_extractor(th.as_tensor(features)).numpy()
-            hidden, cell = (state[0].numpy() for state in self._program_states())
-            actions, hidden, cell = self._sampler.sample(features, hidden, cell, self.reptile.rng)
-            if self.recurrent:
-                states = th.from_numpy(hidden)[None], th.from_numpy(cell)[None]
-                self._last_lstm_states = RNNStates(states, states)
-            return actions.reshape(self.n_envs, *self.action_space.shape)  # type: ignore[misc]
+        if self._sampler is None:
+            return self._act_by_policy(buffer, step)
+        features = np.asarray(self._last_obs, dtype=np.float32)
+        if self.normalize_observations:
+            features = self.policy.features_extractor(th.from_numpy(features)).numpy()
+        return self._sampler.sample(features).reshape(self.n_envs, *self.action_space.shape)  # type: ignore[misc]
+
+    @th.no_grad()
+    def _act_by_policy(self, buffer: RolloutBuffer, step: int) -> np.ndarray:
         obs = obs_as_tensor(self._last_obs, self.device)  # type: ignore[arg-type]
         if self.recurrent:
             starts = th.zeros(self.n_envs, device=self.device)  # states survive the end of an episode
@@ -350,22 +349,25 @@ class ReptilePPO(PPO):
         buffer.log_probs[step] = log_probs.cpu().numpy()
         return drawn.cpu().numpy()
 
-    def _program_states(self) -> State:
-        assert isinstance(self.policy, ProgrammaticActorCritic)
-        if self._last_lstm_states is None:
-            return self.policy.module.initial_state(self.n_envs)
-        return cast(State, self._last_lstm_states.pi)
+    def _present_states(self) -> RNNStates:
+        if self._sampler is not None:
+            return RNNStates(self._sampler.state, self._sampler.state)
+        assert self._last_lstm_states is not None
+        return self._last_lstm_states
 
     @th.no_grad()
     def _complete_rollout(self, buffer: RolloutBuffer, dones: np.ndarray) -> None:
         """Put in what the fast way leaves out, values and log-probabilities, and estimate the advantages."""
+        if self.recurrent:
+            self._last_lstm_states = self._present_states()
         if self._sampler is not None:
-            rollout = self._sequences()
-            values, log_probs, _ = self._evaluate(rollout)
-            assert values is not None
-            shape = (-1, self.n_envs, self.sequence_length)
-            for array, values_of in ((buffer.values, values), (buffer.log_probs, log_probs)):
-                array[:] = values_of.numpy().reshape(shape).swapaxes(1, 2).reshape(array.shape)
+            policy = cast(ProgrammaticActorCritic, self.policy)
+            arrays = (buffer.observations, self._sampler.recorded_tests, buffer.actions)
+            observations, tests, actions = (th.from_numpy(array).flatten(0, 1) for array in arrays)
+            values, log_probs = policy.evaluate_tests(observations, tests, self._typed(actions))
+            buffer.values[:], buffer.log_probs[:] = (
+                tensor.numpy().reshape(buffer.values.shape) for tensor in (values, log_probs)
+            )
         last_values = self._predict_values(obs_as_tensor(self._last_obs, self.device))  # type: ignore[arg-type]
         buffer.compute_returns_and_advantage(last_values=last_values, dones=dones)
 
@@ -378,7 +380,7 @@ class ReptilePPO(PPO):
 
     def _bootstrap_truncated(self, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
         """Add the value of the state at which an episode was cut short, as PPO does."""
-        rows = [int(row) for row in np.flatnonzero(dones) if infos[row].get("TimeLimit.truncated", False)]
+        rows = [row for row in dones.nonzero()[0].tolist() if infos[row].get("TimeLimit.truncated", False)]
         if rows:
             last = np.stack([infos[row]["terminal_observation"] for row in rows])
             with th.no_grad():
@@ -401,8 +403,12 @@ class ReptilePPO(PPO):
         self._freeze(derivation=searching and not moves_derivation, phi=moves_derivation)
         rollout = self._sequences()
         if moves_derivation:
-            rollout["tests"] = self._condition_values(rollout)
+            rollout = {
+                "terms": self._derivation_terms(rollout),
+                **{name: rollout[name] for name in ("actions", "log_probs", "advantages")},
+            }
         statistics: list[dict[str, th.Tensor]] = []
+        parameters = list(self.policy.parameters())
         for sequences in self._minibatches(len(rollout["advantages"])):
             loss, measured = self._loss(rollout, sequences, clip_range)
             statistics.append(measured)
@@ -410,13 +416,14 @@ class ReptilePPO(PPO):
                 break
             self.policy.optimizer.zero_grad()
             loss.backward()
-            th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+            th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
             self.policy.optimizer.step()
         self._freeze(derivation=False, phi=False)
         self._n_updates += self.n_epochs
         self._log(statistics, clip_range)
         if isinstance(self.policy.features_extractor, NormalizingExtractor):
-            self.policy.features_extractor.update(rollout["observations"].flatten(0, 1))
+            observations = self.rollout_buffer.observations
+            self.policy.features_extractor.update(observations.reshape(-1, observations.shape[-1]))
 
     def _freeze(self, derivation: bool, phi: bool) -> None:
         """Freeze W, or phi, or neither."""
@@ -429,27 +436,34 @@ class ReptilePPO(PPO):
             parameter.requires_grad_(not phi)
 
     @th.no_grad()
-    def _condition_values(self, rollout: Mapping[str, th.Tensor]) -> th.Tensor:
-        """Return B at every step of the rollout: with phi frozen it stays the same throughout the update."""
-        assert isinstance(self.policy, ProgrammaticActorCritic)
+    def _derivation_terms(self, rollout: Mapping[str, th.Tensor]) -> th.Tensor:
+        """Return what an update of W needs to know of every step; with phi frozen it stays the same throughout."""
+        policy = cast(ProgrammaticActorCritic, self.policy)
         observations = rollout["observations"].flatten(0, 1)
-        states = self._states(rollout).pi if self.recurrent else None
-        return self.policy.condition_values(observations, states).unflatten(0, rollout["advantages"].shape)
+        if self._sampler is not None:
+            tests = self._lay_out(self._sampler.recorded_tests).flatten(0, 1)
+        else:
+            tests = policy.condition_values(observations, self._states(rollout).pi if self.recurrent else None)
+        return policy.derivation_terms(observations, tests).unflatten(0, rollout["advantages"].shape)
+
+    def _lay_out(self, array: np.ndarray) -> th.Tensor:
+        """Turn ``(n_steps, n_envs, ...)`` into ``(n_sequences, sequence_length, ...)``."""
+        split = array.reshape(-1, self.sequence_length, self.n_envs, *array.shape[2:]).swapaxes(1, 2)
+        return th.as_tensor(split.reshape(-1, self.sequence_length, *array.shape[2:]), device=self.device)
+
+    def _typed(self, actions: th.Tensor) -> th.Tensor:
+        """Return actions of the buffer, ``(..., action_dim)``, as the distributions take them."""
+        if isinstance(self.action_space, spaces.Discrete):
+            return actions.long().squeeze(-1)
+        if isinstance(self.action_space, spaces.MultiDiscrete):
+            return actions.long()
+        return actions.float() if isinstance(self.action_space, spaces.MultiBinary) else actions
 
     def _sequences(self) -> dict[str, th.Tensor]:
         """Lay the buffer out as ``(n_sequences, sequence_length, ...)``; nothing resets inside: nothing is padded."""
-        buffer, length = self.rollout_buffer, self.sequence_length
-
-        def lay_out(array: np.ndarray) -> th.Tensor:
-            split = array.reshape(-1, length, self.n_envs, *array.shape[2:]).swapaxes(1, 2)
-            return th.as_tensor(split.reshape(-1, length, *array.shape[2:]), device=self.device)
-
         names = ("observations", "actions", "log_probs", "advantages", "returns", "values")
-        rollout = {name: lay_out(getattr(buffer, name)) for name in names}
-        if isinstance(self.action_space, (spaces.Discrete, spaces.MultiDiscrete)):
-            rollout["actions"] = rollout["actions"].long()
-        elif isinstance(self.action_space, spaces.MultiBinary):
-            rollout["actions"] = rollout["actions"].float()
+        rollout = {name: self._lay_out(getattr(self.rollout_buffer, name)) for name in names}
+        rollout["actions"] = self._typed(rollout["actions"])
         if self.recurrent:
             for part in ("pi", "vf"):
                 for i, kind in enumerate("hc"):
@@ -471,12 +485,11 @@ class ReptilePPO(PPO):
 
     def _evaluate(self, batch: Mapping[str, th.Tensor]) -> tuple[th.Tensor | None, th.Tensor, th.Tensor | None]:
         """Return values (``None`` when only W is moved), log-probabilities and entropies of a batch of sequences."""
-        observations, actions = (batch[name].flatten(0, 1) for name in ("observations", "actions"))
-        if isinstance(self.action_space, spaces.Discrete):
-            actions = actions.flatten()
-        if "tests" in batch:
+        actions = batch["actions"].flatten(0, 1)
+        if "terms" in batch:
             policy = cast(ProgrammaticActorCritic, self.policy)
-            return None, *policy.evaluate_derivation(observations, batch["tests"].flatten(0, 1), actions)
+            return None, *policy.evaluate_derivation(batch["terms"].flatten(0, 1), actions)
+        observations = batch["observations"].flatten(0, 1)
         if not self.recurrent:
             return self.policy.evaluate_actions(observations, actions)
         starts = th.zeros(len(observations), device=self.device)

@@ -61,7 +61,7 @@ class BatchedVecEnv(VecEnv):
         observations, rewards, terminated, truncated, batch = self.env.step(self._actions)
         dones = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for row in np.flatnonzero(dones):
+        for row in dones.nonzero()[0]:
             infos[row] = {
                 "terminal_observation": batch["final_obs"][row],
                 "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),

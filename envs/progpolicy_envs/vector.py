@@ -99,7 +99,7 @@ class PlanningVectorEnv(VectorEnv, ABC):
         truncated = (self._elapsed >= self.max_episode_steps) & ~terminated
         observations = self._observe()
         infos: dict[str, Any] = {"is_success": terminated}
-        ended = np.flatnonzero(terminated | truncated)
+        (ended,) = (terminated | truncated).nonzero()
         if len(ended):
             infos["final_obs"] = np.full(self.num_envs, None, dtype=object)
             for row in ended:

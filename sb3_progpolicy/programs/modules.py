@@ -174,44 +174,95 @@ class ProgramModule(nn.Module):
         """Number of controllers in the graph."""
         return 2 * self.depth - 1
 
-    def masses(self, tests: th.Tensor, crisp: bool = False) -> th.Tensor:
-        """Return the mass of every controller.
+    @property
+    def controllers_in_use(self) -> list[int]:
+        """Which controllers can decide: all of them during the search, then those of the selected program."""
+        return (
+            list(range(self.n_controllers))
+            if self.search.searching
+            else self._controller_rows(self.search.most_likely())
+        )
+
+    def reach(self, tests: th.Tensor, crisp: bool = False) -> th.Tensor:
+        """Return how probable it is for the branches of its program to lead to each controller in use.
 
         :param tests: the values of B, ``(..., depth - 1)``
         :param crisp: decide each branch by ``B >= 0`` instead of weighing it
-        :return: ``(..., 2 depth - 1)``, non-negative, summing to 1; then-controllers first
+        :return: ``(..., n_in_use)``, then-controllers first; the last controllers are those of programs of any length
         """
+        if not self.search.searching:
+            tests = tests[..., : self.search.most_likely()]
         taken = (tests >= 0).to(tests.dtype) if crisp else th.sigmoid(tests / self.temperature)
-        missed = th.cumprod(1 - taken, dim=-1)
-        one = th.ones_like(tests[..., :1]) if self.depth > 1 else tests.new_ones(*tests.shape[:-1], 1)
-        reached = th.cat((one, missed), dim=-1)
-        then = taken * reached[..., :-1] * self.search.at_least()
-        return th.cat((then, reached * self.search.probabilities()), dim=-1)
+        reached = th.cat((tests.new_ones(*tests.shape[:-1], 1), th.cumprod(1 - taken, dim=-1)), dim=-1)
+        last = reached if self.search.searching else reached[..., -1:]
+        return th.cat((taken * reached[..., :-1], last), dim=-1)
+
+    def choices(self) -> th.Tensor:
+        """Return how probable it is under W for a program to contain each controller in use, ``(n_in_use,)``."""
+        if not self.search.searching:
+            return self.controllers.weight.new_ones(self.search.most_likely() + 1)
+        return th.cat((self.search.at_least(), self.search.probabilities()))
+
+    def masses(self, tests: th.Tensor, crisp: bool = False) -> th.Tensor:
+        """Return the mass of every controller in use, non-negative and summing to 1. See :meth:`reach`."""
+        reach = self.reach(tests, crisp)
+        return reach * self.choices() if self.search.searching else reach
 
     def mix(self, inputs: th.Tensor, masses: th.Tensor) -> th.Tensor:
         """Return the parameters of the action distribution.
 
         :param inputs: X, ``(..., n_inputs)``
-        :param masses: ``(..., 2 depth - 1)``
+        :param masses: ``(..., n_in_use)``
         :return: ``(..., n_outputs)``: means for Box, log-probabilities for Discrete and MultiDiscrete (per component),
             log-odds for MultiBinary
         """
-        flat = inputs.flatten(0, -2)
-        # Rows last: softmax and sums then run along contiguous memory, twice as fast as over a last axis of a few.
-        outputs = th.addmm(self.controllers.bias.unsqueeze(1), self.controllers.weight, flat.T)
-        outputs = outputs.unflatten(0, (self.n_controllers, self.action.n_outputs))
         weights = masses.flatten(0, -2).T.unsqueeze(1)
-        return self._mix_rows(outputs, weights).T.unflatten(0, inputs.shape[:-1])
+        mixed = (weights * self._terms(inputs)).sum(0)
+        return self._to_parameters(mixed.T.unflatten(0, inputs.shape[:-1]))
 
-    def _mix_rows(self, outputs: th.Tensor, weights: th.Tensor) -> th.Tensor:
-        """Mix ``(n_controllers, n_outputs, rows)`` with weights ``(n_controllers, 1, rows)``."""
+    def derivation_terms(self, inputs: th.Tensor, tests: th.Tensor) -> th.Tensor:
+        """Return the matrices by which the mixture is linear in W's probabilities, as long as phi stays.
+
+        :param inputs: X, ``(n, n_inputs)``
+        :param tests: the values of B, ``(n, depth - 1)``
+        :return: ``(n, n_terms, n_in_use)``, for :meth:`mix_derivation`
+        """
+        terms = self.reach(tests).T.unsqueeze(1) * self._terms(inputs)
+        return terms.permute(2, 1, 0).contiguous()
+
+    def mix_derivation(self, terms: th.Tensor) -> th.Tensor:
+        """Return what :meth:`mix` returns, from :meth:`derivation_terms`, ``(n, n_outputs)``."""
+        return self._to_parameters(terms @ self.choices())
+
+    def _terms(self, inputs: th.Tensor) -> th.Tensor:
+        """Return what is mixed, ``(n_in_use, n_terms, rows)``: values, or probabilities.
+
+        Rows come last: softmax and sums then run along contiguous memory, twice as fast as over a last axis of a few.
+        """
+        weight, bias, in_use = self.controllers.weight, self.controllers.bias, self.controllers_in_use
+        if len(in_use) < self.n_controllers:
+            rows = th.tensor(in_use, device=weight.device)
+            weight, bias = (
+                block.unflatten(0, (self.n_controllers, -1))[rows].flatten(0, 1) for block in (weight, bias)
+            )
+        outputs = th.addmm(bias.unsqueeze(1), weight, inputs.flatten(0, -2).T)
+        outputs = outputs.unflatten(0, (len(in_use), self.action.n_outputs))
         if self.action.kind == "box":
-            return (weights * outputs).sum(0)
+            return outputs
         if self.action.kind == "multi_binary":
-            on, off = (weights * th.sigmoid(sign * outputs) for sign in (1, -1))
-            return _log(on.sum(0)) - _log(off.sum(0))
-        components = outputs.split(list(self.action.sizes), dim=1)
-        return th.cat([_log((weights * component.softmax(1)).sum(0)) for component in components])
+            return th.cat((th.sigmoid(outputs), th.sigmoid(-outputs)), dim=1)
+        if self.action.kind == "discrete":
+            return outputs.softmax(1)
+        return th.cat([component.softmax(1) for component in outputs.split(list(self.action.sizes), dim=1)], dim=1)
+
+    def _to_parameters(self, mixed: th.Tensor) -> th.Tensor:
+        """Turn mixed terms ``(..., n_terms)`` into the parameters of the action distribution."""
+        if self.action.kind == "box":
+            return mixed
+        if self.action.kind == "multi_binary":
+            on, off = mixed.chunk(2, dim=-1)
+            return _log(on) - _log(off)
+        return _log(mixed)
 
     def forward(self, inputs: th.Tensor, state: State, crisp: bool = False) -> tuple[th.Tensor, State]:
         """Run the program over a sequence.

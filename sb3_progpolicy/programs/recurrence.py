@@ -59,7 +59,7 @@ class _Scan(th.autograd.Function):
         context = cast(Any, ctx)
         d_states = np.ascontiguousarray(d_outputs.numpy().swapaxes(1, 2))
         d_gates, d_recurrent, d_hidden = _BACKWARD[context.kind](d_states, context.weight.T.copy(), *context.tape)
-        d_weight = np.einsum("tgn,tun->gu", d_recurrent, context.states[:-1], optimize=True)
+        d_weight = np.tensordot(d_recurrent, context.states[:-1], axes=((0, 2), (0, 2)))
         d_bias = d_recurrent.sum((0, 2))
         d_inputs = np.ascontiguousarray(d_gates.swapaxes(1, 2))
         gradients = (d_inputs, d_weight, d_bias, np.ascontiguousarray(d_hidden.T))
@@ -89,44 +89,45 @@ def _rnn_backward(d_states: Array, weight: Array, slope: Array) -> tuple[Array, 
 def _gru_forward(gates: Array, weight: Array, bias: Array, hidden: Array) -> tuple[Array, Tape]:
     n_steps, width, n_sequences = gates.shape
     units = width // 3
-    states = np.empty((n_steps + 1, units, n_sequences), gates.dtype)
-    states[0] = hidden
-    inner_bias = bias[2 * units :]
-    # sigmoid(x) = tanh(x / 2) / 2 + 1 / 2: the inner half goes into what is added up.
-    halves = np.repeat(np.array([0.5, 0.5, 1.0], gates.dtype), units)[:, None]
-    weight = weight * halves
-    gates = gates * halves
-    gates[:, : 2 * units] += 0.5 * bias[: 2 * units]
-    to_gates, to_new = np.split(weight, [2 * units])
+    # A last row of ones below the states multiplies the bias, so that one product does all that is recurrent.
+    states = np.ones((n_steps + 1, units + 1, n_sequences), gates.dtype)
+    states[0, :units] = hidden
+    # 2 sigmoid(x) = tanh(x / 2) + 1: the halves go into the weights, that of the reset gate into what it multiplies.
+    weight = 0.5 * np.concatenate((weight, bias), axis=1)
+    gates_both = 0.5 * gates[:, : 2 * units]
+    recurrent = np.empty((n_steps, width, n_sequences), gates.dtype)
     reset_update = np.empty((n_steps, 2 * units, n_sequences), gates.dtype)
-    new, inner = (np.empty((n_steps, units, n_sequences), gates.dtype) for _ in range(2))
+    new = np.empty((n_steps, units, n_sequences), gates.dtype)
     rows = zip(
-        gates[:, : 2 * units],
+        gates_both,
         gates[:, 2 * units :],
+        recurrent,
+        recurrent[:, : 2 * units],
+        recurrent[:, 2 * units :],
         reset_update,
         reset_update[:, :units],
         reset_update[:, units:],
-        inner,
         new,
         states[:-1],
-        states[1:],
+        states[:-1, :units],
+        states[1:, :units],
         strict=True,
     )
-    for gate, gate_new, both, reset, update, recurrent, candidate, before, after in rows:
-        np.matmul(to_gates, before, out=both)
-        both += gate
+    for gate, gate_new, product, to_gates, to_new, both, reset, update, candidate, before_one, before, after in rows:
+        np.matmul(weight, before_one, out=product)
+        np.add(to_gates, gate, out=both)
         np.tanh(both, out=both)
-        both *= 0.5
-        both += 0.5
-        np.matmul(to_new, before, out=recurrent)
-        recurrent += inner_bias
-        np.multiply(reset, recurrent, out=candidate)
+        both += 1
+        np.multiply(reset, to_new, out=candidate)
         candidate += gate_new
         np.tanh(candidate, out=candidate)
         np.subtract(before, candidate, out=after)
         after *= update
+        after *= 0.5
         after += candidate
-    return states, (states, reset_update, new, inner)
+    reset_update *= 0.5
+    states = states[:, :units]
+    return states, (states, reset_update, new, 2 * recurrent[:, 2 * units :])
 
 
 def _gru_backward(

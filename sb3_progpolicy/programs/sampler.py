@@ -9,26 +9,37 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_progpolicy.programs.cells import STEPS, Array, sigmoid
-from sb3_progpolicy.programs.modules import ProgramModule
+from sb3_progpolicy.programs.modules import ProgramModule, State
 
 
 class ProgramSampler:
-    """Runs a :class:`ProgramModule` one step at a time for a batch of environments and samples actions.
+    """Runs a :class:`ProgramModule` for ``n_steps`` steps in a batch of environments and samples actions.
 
-    It computes what the module computes under the soft semantics, W included.
+    It computes what the module computes under the soft semantics, W included, keeps the states of the conditions
+    from one step to the next and records the values of the conditions. Box actions need the mixture; all others are
+    drawn by drawing a program from W and running it, with a random choice at every branch.
 
     :param module: the program mixture, on the CPU; its parameters are read now: one sampler for each rollout
+    :param state: of the conditions at the start: two tensors ``(1, n_envs, hidden_size)``
+    :param n_steps: how many times :meth:`sample` is called at most
+    :param rng: source of all randomness, all of it drawn now
     :param log_std: logarithm of the standard deviations of Box actions, ``(n_outputs,)``
     """
 
-    def __init__(self, module: ProgramModule, log_std: th.Tensor | None = None) -> None:
+    def __init__(
+        self,
+        module: ProgramModule,
+        state: State,
+        n_steps: int,
+        rng: np.random.Generator,
+        log_std: th.Tensor | None = None,
+    ) -> None:
         self.action, conditions = module.action, module.conditions
         self.n_conditions, self.size, self.cell = conditions.n_conditions, conditions.size, conditions.cell
-        with th.no_grad():
-            self._at_least = _view(module.search.at_least())
-            self._probabilities = _view(module.search.probabilities())
-        self._scale = 1 / float(module.temperature)
-        self._n_controllers = module.n_controllers
+        self._in_use = module.controllers_in_use
+        self._selected = None if module.search.searching else module.search.most_likely()
+        self._choices = module.choices().detach().numpy()
+        self._temperature = float(module.temperature)
         self._std = None if log_std is None else np.exp(_view(log_std))
         self.needs_conditions = module.search.needs_conditions and self.n_conditions > 0
         self.recurrent = conditions.recurrent and self.needs_conditions
@@ -44,83 +55,130 @@ class ProgramSampler:
         else:
             input_weight, input_bias = np.zeros((0, module.n_inputs), np.float32), np.zeros(0, np.float32)
         self._n_gates = len(input_bias)
-        controllers = module.controllers
-        self._affine = np.ascontiguousarray(np.concatenate((input_weight, _view(controllers.weight))).T)
-        self._constant = np.concatenate((input_bias, _view(controllers.bias)))
-        self._edges = np.cumsum(self.action.sizes)[:-1]
-        self._mass_sum, self._n_samples = np.zeros(self._n_controllers), 0
+        controllers = (
+            _view(parameter).reshape(module.n_controllers, self.action.n_outputs, -1)[self._in_use]
+            for parameter in (module.controllers.weight, module.controllers.bias)
+        )
+        controller_weight, controller_bias = (block.reshape(-1, block.shape[-1]) for block in controllers)
+        self._affine = np.ascontiguousarray(np.concatenate((input_weight, controller_weight)).T)
+        self._constant = np.concatenate((input_bias, controller_bias[:, 0]))
+        self._hidden, self._cell = (_view(tensor)[0] for tensor in state)
+        n_envs = len(self._hidden)
+        self._rows, self._step = np.arange(n_envs), 0
+        #: Values of B at the steps made so far, ``(n_steps, n_envs, n_conditions)``; 0 where none is needed.
+        self.recorded_tests = np.zeros((n_steps, n_envs, self.n_conditions), dtype=np.float32)
+        self._n_controllers = module.n_controllers
+        # Noise of all steps is drawn at once, which is several times cheaper than a little at every step.
+        if self.action.kind == "box":
+            self._noise = rng.standard_normal((n_steps, n_envs, self.action.n_outputs), dtype=np.float32)
+        else:
+            sizes = (1,) * self.action.n_outputs if self.action.kind == "multi_binary" else self.action.sizes
+            self._edges = np.cumsum(sizes)[:-1]
+            self._draw_programs((n_steps, len(sizes), n_envs), rng)
 
-    def tests(self, gates: Array, hidden: Array, cell: Array) -> tuple[Array, Array, Array]:
-        """Return the values of B ``(n_envs, n_conditions)`` and the new states.
+    def _draw_programs(self, shape: tuple[int, int, int], rng: np.random.Generator) -> None:
+        """Draw a program for every action, how its branches will fall, and the noise of its controller's choice."""
+        n_tests = self.n_conditions if self._selected is None else self._selected
+        self._last_controllers = np.full(shape, n_tests)
+        # B plus logistic noise is above 0 with the probability sigmoid(B).
+        self._thresholds = self._temperature * _logistic(rng, (n_tests, *shape))
+        if self._selected is None:
+            edges = np.cumsum(self._choices[n_tests:-1])
+            lengths = np.searchsorted(edges, rng.random(shape, dtype=np.float32), side="right")
+            self._last_controllers += lengths
+            self._thresholds[np.arange(n_tests)[:, None, None, None] >= lengths] = np.inf  # not in this program
+        # Logits plus logistic noise are above 0 as often as their sigmoid says; the largest of logits plus Gumbel noise
+        # is a draw from their softmax.
+        size = (shape[0], shape[2], self.action.n_outputs)
+        noise = _logistic if self.action.kind == "multi_binary" else _gumbel
+        self._noise = noise(rng, size)
 
-        :param gates: the affine part of the conditions, ``(n_envs, n_gates * hidden_size)``
-        :param hidden: ``(n_envs, hidden_size)``
-        :param cell: ``(n_envs, hidden_size)``, used by LSTM conditions
-        """
-        if not self.needs_conditions:
-            return np.zeros((len(gates), self.n_conditions), dtype=np.float32), hidden, cell
-        if not self.recurrent:
-            return gates, hidden, cell
-        hidden, cell = STEPS[self.cell](gates, hidden @ self._weight + self._bias, hidden, cell)
-        if self.size == 1:
-            return hidden * self._readout[:, 0] + self._readout_bias, hidden, cell
-        units = hidden.reshape(len(gates), self.n_conditions, self.size)
-        return (units * self._readout).sum(-1) + self._readout_bias, hidden, cell
+    @property
+    def state(self) -> State:
+        """The states of the conditions after the last step."""
+        hidden, cell = (th.from_numpy(array)[None] for array in (self._hidden, self._cell))
+        return hidden, cell
 
     def masses(self, tests: Array) -> Array:
-        """Return the mass of every controller, as :meth:`ProgramModule.masses` does."""
-        taken = sigmoid(tests * self._scale)
-        reached = np.empty((len(tests), self.n_conditions + 1), dtype=np.float32)
+        """Return the mass of every controller in use, as :meth:`ProgramModule.masses` does.
+
+        :param tests: ``(n_envs, n_conditions)``
+        """
+        tests = tests[:, : self._selected]
+        if not tests.shape[1]:
+            return np.ones((len(tests), 1), dtype=np.float32)
+        taken = sigmoid(tests / self._temperature)
+        reached = np.empty((len(tests), tests.shape[1] + 1), dtype=np.float32)
         reached[:, 0] = 1
-        np.cumprod(1 - taken, axis=1, out=reached[:, 1:])
-        return np.concatenate((taken * reached[:, :-1] * self._at_least, reached * self._probabilities), axis=1)
+        np.multiply.accumulate(1 - taken, axis=1, out=reached[:, 1:])
+        last = reached if self._selected is None else reached[:, -1:]
+        masses = np.concatenate((taken * reached[:, :-1], last), axis=1)
+        return masses * self._choices if self._selected is None else masses
 
     def branch_frequencies(self) -> Array:
-        """Return the share of the samples drawn so far that each controller decided, ``(2 depth - 1,)``."""
-        return self._mass_sum / max(1, self._n_samples)
+        """Return how probable it was at the steps so far that each controller decided, ``(2 depth - 1,)``."""
+        shares = np.zeros(self._n_controllers)
+        tests = self.recorded_tests[: self._step].reshape(self._step * len(self._rows), self.n_conditions)
+        shares[self._in_use] = self.masses(tests).mean(0)
+        return shares
 
-    def sample(
-        self, inputs: Array, hidden: Array, cell: Array, rng: np.random.Generator
-    ) -> tuple[NDArray[Any], Array, Array]:
+    def sample(self, inputs: Array) -> NDArray[Any]:
         """Draw one action for every environment.
 
         :param inputs: X, ``(n_envs, n_inputs)``
-        :param hidden: ``(n_envs, hidden_size)``
-        :param cell: ``(n_envs, hidden_size)``
-        :param rng: source of all randomness
-        :return: actions ``(n_envs, *action_shape)`` (Discrete without ``start``, Box flat and unclipped), new states
+        :return: actions ``(n_envs, *action_shape)`` (Discrete without ``start``, Box flat and unclipped)
         """
-        affine = inputs @ self._affine + self._constant
-        tests, hidden, cell = self.tests(affine[:, : self._n_gates], hidden, cell)
-        masses = self.masses(tests)
-        self._mass_sum += masses.sum(0)
-        self._n_samples += len(masses)
-        outputs = affine[:, self._n_gates :].reshape(len(inputs), self._n_controllers, -1)
+        step, self._step = self._step, self._step + 1
+        affine = inputs @ self._affine
+        affine += self._constant
+        if self.needs_conditions:
+            self._run_conditions(affine[:, : self._n_gates], out=self.recorded_tests[step])
+        outputs = affine[:, self._n_gates :].reshape(len(inputs), len(self._in_use), -1)
         if self.action.kind == "box":
-            mean = (masses[:, :, None] * outputs).sum(1)
-            return mean + self._std * rng.standard_normal(mean.shape, dtype=np.float32), hidden, cell
-        if self.action.kind == "multi_binary":
-            probabilities = (masses[:, :, None] * sigmoid(outputs)).sum(1)
-            return (rng.random(probabilities.shape) < probabilities).astype(np.int8), hidden, cell
+            masses = self.masses(self.recorded_tests[step])
+            return (masses[:, :, None] * outputs).sum(1) + self._std * self._noise[step]
         if self.action.kind == "discrete":
-            return _draw(masses, outputs, rng), hidden, cell
-        drawn = [_draw(masses, component, rng) for component in np.split(outputs, self._edges, axis=2)]
-        return np.stack(drawn, axis=1), hidden, cell
+            return (outputs[self._rows, self._controllers(step, 0)] + self._noise[step]).argmax(1)
+        components = np.split(outputs + self._noise[step][:, None], self._edges, axis=2)
+        chosen = [part[self._rows, self._controllers(step, i)] for i, part in enumerate(components)]
+        if self.action.kind == "multi_binary":
+            return (np.concatenate(chosen, axis=1) > 0).astype(np.int8)
+        return np.stack([logits.argmax(1) for logits in chosen], axis=1)
+
+    def _controllers(self, step: int, component: int) -> NDArray[np.int64]:
+        """Run the programs drawn for one component of the action; return which controller decides, ``(n_envs,)``."""
+        controllers = self._last_controllers[step, component]
+        for k in reversed(range(len(self._thresholds))):
+            np.copyto(controllers, k, where=self.recorded_tests[step, :, k] > self._thresholds[k, step, component])
+        return controllers
+
+    def _run_conditions(self, gates: Array, out: Array) -> None:
+        """Advance the states and write the values of B into ``out``.
+
+        :param gates: the affine part of the conditions, ``(n_envs, n_gates * hidden_size)``
+        :param out: ``(n_envs, n_conditions)``
+        """
+        if not self.recurrent:
+            out[:] = gates
+            return
+        recurrent = self._hidden @ self._weight
+        recurrent += self._bias
+        self._hidden, self._cell = STEPS[self.cell](gates, recurrent, self._hidden, self._cell)
+        if self.size == 1:
+            np.multiply(self._hidden, self._readout[:, 0], out=out)
+        else:
+            units = self._hidden.reshape(len(gates), self.n_conditions, self.size)
+            np.add.reduce(units * self._readout, -1, out=out)
+        out += self._readout_bias
 
 
-def _draw(masses: Array, outputs: Array, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Sample from the mixture of softmaxes: first a controller by its mass, then an action by its softmax.
+def _gumbel(rng: np.random.Generator, size: tuple[int, ...]) -> Array:
+    exponential = rng.standard_exponential(size, dtype=np.float32)
+    return -np.log(np.maximum(exponential, np.finfo(np.float32).tiny))
 
-    :param masses: ``(n_envs, n_controllers)``
-    :param outputs: ``(n_envs, n_controllers, n_choices)``
-    """
-    rows = np.arange(len(masses))
-    edges = masses.cumsum(1)
-    # The last edge is left out, so that rounding cannot lead past the last controller.
-    controllers = (edges[:, :-1] <= rng.random((len(rows), 1))).sum(1)
-    chosen = outputs[rows, controllers]
-    # Adding Gumbel noise to the logits and taking the largest is sampling from their softmax.
-    return (chosen - np.log(rng.standard_exponential(chosen.shape))).argmax(1)
+
+def _logistic(rng: np.random.Generator, size: tuple[int, ...]) -> Array:
+    return _gumbel(rng, size) - _gumbel(rng, size)
 
 
 def _view(tensor: th.Tensor) -> Array:

@@ -10,16 +10,20 @@ from tests.programs.test_modules import ACTIONS, CELLS, N_INPUTS, make_module, m
 N_DRAWS = 20_000
 
 
+def make_sampler(module, n_steps=1, n_envs=1, log_std=None, seed=0):
+    return ProgramSampler(module, module.initial_state(n_envs), n_steps, np.random.default_rng(seed), log_std)
+
+
 def draw(module, kind, n_steps=3, log_std=None, seed=0):
     """Feed all rows the same X, so that they are independent draws; return the last actions and both states."""
     x = th.randn(n_steps, 1, N_INPUTS, generator=th.Generator().manual_seed(seed)).expand(-1, N_DRAWS, -1)
-    sampler, rng = ProgramSampler(module, log_std), np.random.default_rng(seed)
-    hidden, cell = (state[0].numpy() for state in module.initial_state(N_DRAWS))
+    sampler = make_sampler(module, n_steps, N_DRAWS, log_std, seed)
     for step in x.contiguous().numpy():
-        actions, hidden, cell = sampler.sample(step, hidden, cell, rng)
+        actions = sampler.sample(step)
     with th.no_grad():
         parameters, state = module(x[:, :1], module.initial_state(1))
-    return actions, (hidden, cell), meaning_of_mixture(kind, parameters[-1, 0]), state
+    states = tuple(tensor[0].numpy() for tensor in sampler.state)
+    return actions, states, meaning_of_mixture(kind, parameters[-1, 0]), state
 
 
 @pytest.mark.parametrize("cell", CELLS)
@@ -63,5 +67,5 @@ def test_states_are_those_of_the_module(cell, size):
 def test_masses_are_those_of_the_module(depth):
     module = make_module(depth=depth)
     tests = np.random.default_rng(0).normal(size=(7, depth - 1)).astype(np.float32)
-    masses = ProgramSampler(module).masses(tests)
+    masses = make_sampler(module).masses(tests)
     np.testing.assert_allclose(masses, module.masses(th.from_numpy(tests)).detach(), atol=1e-6)
