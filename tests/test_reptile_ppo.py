@@ -9,6 +9,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_progpolicy import InteractionHistory, ReptilePPO, VecInteractionHistory
@@ -78,7 +79,7 @@ def test_hidden_state_survives_episode_end_but_not_task_switch(policy):
 
         def _on_step(self):
             assert self.locals["dones"].all()
-            after_step.append(self.model._last_lstm_states.pi[0].clone())
+            after_step.append(self.model._present_states().pi[0].clone())
             return True
 
     model.learn(64, callback=Watch())
@@ -146,6 +147,35 @@ def test_rollout_of_the_sampler_is_that_of_the_policy_stepped_by_hand(cell):
         expected = distribution.log_prob(actions[t]).detach()
         th.testing.assert_close(th.as_tensor(buffer.log_probs.reshape(16, 4)[t]), expected, atol=1e-5, rtol=1e-5)
     th.testing.assert_close(model._last_lstm_states.pi[0], state[0].detach(), atol=1e-5, rtol=1e-5)
+
+
+class OwnExtractor(FlattenExtractor):
+    """Not one the sampler knows, so that the policy itself acts in rollouts, as it does on a GPU."""
+
+
+@pytest.mark.parametrize(
+    ("policy", "cell", "space"),
+    [
+        *(("ProgPolicy", cell, spaces.Discrete(2, start=5)) for cell in ("gru", "lstm", "rnn", "affine")),
+        ("ProgPolicy", "gru", spaces.Box(-1, 1, (2,))),
+        ("ProgPolicy", "gru", spaces.MultiDiscrete([2, 3])),
+        ("ProgPolicy", "gru", spaces.MultiBinary(2)),
+        ("PRLPolicy", "affine", spaces.Discrete(2, start=5)),
+    ],
+)
+def test_policies_train_without_the_sampler(policy, cell, space):
+    policy_kwargs = {"cell": cell, "features_extractor_class": OwnExtractor}
+    env = DummyVecEnv([lambda: OneStep(space)] * 4)
+    model = make(policy, env, n_epochs=1, search_fraction=1.0, policy_kwargs=policy_kwargs)
+    # Rollouts for an update of phi and one of W, each from parameters that have not moved since.
+    for ratio, values in log_ratios(model):
+        assert ratio.abs().max() < 1e-5
+        assert values.abs().max() < 1e-4
+    assert model._sampler is None
+    before = weights(model)
+    model.lr_schedule = lambda _: 0.01
+    model.learn(model.n_steps * model.n_envs * 2)
+    assert (weights(model) != before).any()
 
 
 def test_truncated_episodes_are_bootstrapped_and_ended_ones_are_not():
