@@ -99,13 +99,14 @@ class TaskDistribution:
 
     :param variations: a mapping from parameter to values (a sequence, a ``range``, or a callable that draws a value
         from a ``numpy.random.Generator``), of which all combinations are taken; or a sequence of such mappings from
-        parameter to one value. Order them from the easiest for a curriculum.
+        parameter to one value, the same parameters in all. Order them from the easiest for a curriculum.
     :param sampler: ``"uniform"``, ``"curriculum"``, ``"failure"`` or a :class:`Sampler`
     :param apply: how a variation is put in force: ``"options"`` by ``reset(options=...)``, which the environment must
         keep in force over the episodes that follow, as all of ``progpolicy_envs`` do; ``"attributes"`` by setting
         attributes of the environment, ``"constructor"`` by making the environment anew (see
         :class:`RemakeOnVariation`)
-    :raises ValueError: if there is no variation, or a name is not known
+    :raises ValueError: if there is no variation, a name is not known, or some variations leave a parameter out (which
+        is accepted with ``apply="constructor"`` alone, where it has its default value)
     """
 
     #: Weight of the newest episodes in the running success rates.
@@ -126,6 +127,13 @@ class TaskDistribution:
             sampler = SAMPLERS[sampler]()
         if apply not in APPLY:
             raise ValueError(f"apply={apply!r} is not accepted; known: {', '.join(APPLY)}")
+        names = [set(variation) for variation in self.variations]
+        if apply != "constructor" and any(given != names[0] for given in names):
+            left_out = sorted(name for name in set[str]().union(*names) if any(name not in given for given in names))
+            raise ValueError(
+                f"variations={variations!r} is not accepted; some of them leave out {', '.join(left_out)}, which would "
+                "stay what the task before made it. Give every variation a value for it"
+            )
         self.sampler, self.apply = sampler, apply
         self.success_rates = np.full(len(self.variations), np.nan)
 

@@ -21,7 +21,7 @@ def test_mapping_makes_all_combinations_and_a_list_is_taken_as_it_is():
     tasks = TaskDistribution({"a": [1, 2], "b": range(3, 5), "c": np.array([0.5])})
     assert tasks.variations == [{"a": a, "b": b, "c": 0.5} for a in (1, 2) for b in (3, 4)]
     assert len(tasks) == 4
-    assert TaskDistribution([{"a": 1}, {"a": 2, "b": 1}]).variations == [{"a": 1}, {"a": 2, "b": 1}]
+    assert TaskDistribution([{"a": 1}, {"a": 2}]).variations == [{"a": 1}, {"a": 2}]
 
 
 def test_callables_are_drawn_anew_each_time():
@@ -143,6 +143,16 @@ def test_environments_that_cannot_be_varied_so_are_refused(apply):
 def test_what_makes_no_distribution_is_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         TaskDistribution(*arguments)
+
+
+@pytest.mark.parametrize("apply", ["options", "attributes", "constructor"])
+def test_variations_set_the_same_parameters_unless_the_environment_is_made_anew(apply):
+    variations = [{"n_discs": 2}, {"n_discs": 3, "source": 1}]
+    if apply == "constructor":
+        assert TaskDistribution(variations, apply=apply).variations == variations
+        return
+    with pytest.raises(ValueError, match="leave out source"):
+        TaskDistribution(variations, apply=apply)
 
 
 def test_samplers_refuse_values_out_of_range():
