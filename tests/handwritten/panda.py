@@ -12,14 +12,14 @@ from tests.handwritten.build import Builder
 
 Sum = Mapping[str, float]  # weights by input name; "1" is the constant
 GAIN = 20.0  # units of action per metre: 1 is 5 cm
+#: The arm covers a little more than half of what it is asked for, so this is not too much where a block is set down.
+CARRY_GAIN = 30.0
 
 NOTHING: Sum = {}
 OPEN, CLOSE = {"1": 1.0}, {"1": -1.0}
 HALF_OPEN = {"1": 0.2, "fingers": -5.0}  # 4 cm, narrower than a puck
 TO_OBJECT_X, TO_OBJECT_Y, TO_OBJECT_Z = ({f"object_d{axis}": GAIN} for axis in "xyz")
 TO_TARGET_X, TO_TARGET_Y, TO_TARGET_Z = ({f"target_d{axis}": GAIN} for axis in "xyz")
-FROM_OBJECT_TO_TARGET_X = {"target_x": GAIN, "object_x": -GAIN}
-FROM_OBJECT_TO_TARGET_Y = {"target_y": GAIN, "object_y": -GAIN}
 #: Stays while the fingers hold a block and rises when they have let go of it.
 RISE_WHEN_OPEN = {"fingers": 35.0, "1": -1.25}
 
@@ -122,25 +122,32 @@ def slide_program() -> Program:
 def stack_program() -> Program:
     """Return the program that picks a block up, brings it over its place, sets it down and leaves it.
 
-    The place is the tip of two cones. A block above the flat one can only be carried, and comes down on that cone,
-    clear of the tower. At the tip the steep one says that it is set down; both hold for towers of any height.
+    The place is the tip of two cones that stand on it. A block above the flat one can only be carried: it comes down
+    along a cone in between, clear of the tower. A block at the tip, within the steep one, has been set down. Both hold
+    for towers of any height, and no block on the table is in either of them.
     """
     builder = PandaBuilder()
     above_place = {"object_z": 1.0, "target_z": -1.0}
-    cone = {"target_z": GAIN, "object_z": -GAIN, "distance": 0.5 * GAIN, "1": -0.08}
+    carry = builder.move(
+        {"target_x": CARRY_GAIN, "object_x": -CARRY_GAIN},
+        {"target_y": CARRY_GAIN, "object_y": -CARRY_GAIN},
+        {"target_z": GAIN, "object_z": -GAIN, "distance": 0.5 * GAIN, "1": -0.08},
+        CLOSE,
+    )
     branches = [
+        (builder.when(**above_place, distance=-0.2, constant=-0.009), carry),
         (
-            builder.when(**above_place, distance=-0.3, constant=-0.004),
-            builder.move(FROM_OBJECT_TO_TARGET_X, FROM_OBJECT_TO_TARGET_Y, cone, CLOSE),
-        ),
-        (
-            builder.when(**above_place, distance=-2.0, constant=0.008),
+            builder.when(**above_place, distance=-0.8, constant=0.01),
             builder.move(TO_OBJECT_X, TO_OBJECT_Y, RISE_WHEN_OPEN, OPEN),
         ),
-        (builder.in_funnel(), builder.go_to_object(OPEN)),
-        # Above the tower or far from the block: over the block, 6 cm above its place in the tower.
+        # In the funnel above the block: down, a little below its middle.
         (
-            builder.when(target_dz=-1.0, reach=2.0, constant=-0.14),
+            builder.when(object_dz=-1.0, reach=-3.0, constant=-0.003),
+            builder.move(TO_OBJECT_X, TO_OBJECT_Y, {**TO_OBJECT_Z, "1": -0.006 * GAIN}, OPEN),
+        ),
+        # Above the tower or far from the block, so without it: over the block, 6 cm above its place.
+        (
+            builder.when(target_dz=-1.0, reach=4.0, constant=-0.17),
             builder.move(TO_OBJECT_X, TO_OBJECT_Y, {**TO_TARGET_Z, "1": 0.06 * GAIN}, OPEN),
         ),
         (builder.not_around(), builder.move(NOTHING, NOTHING, RISE_WHEN_OPEN, OPEN)),
