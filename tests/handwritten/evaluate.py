@@ -1,5 +1,6 @@
 """Run programs crisply on environments, with the history of section 2.4, and count their steps."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,11 +13,11 @@ from sb3_progpolicy.programs import Controller, IfThenElse, Program, ProgramRunn
 
 @dataclass(frozen=True)
 class Episode:
-    """How one episode went."""
+    """How one episode went; ``optimal`` is the planner's number of steps, where the environment tells it."""
 
     success: bool
     steps: int
-    optimal: int
+    optimal: int | None
 
 
 class Player:
@@ -46,13 +47,25 @@ def play(program: Program | Player, env: gym.Env[Any, Any], seed: int | None = N
     """
     player = program if isinstance(program, Player) else Player(program)
     observation, info = env.reset(seed=seed, options=options)
-    optimal, ended, steps = info["optimal_steps"], False, 0
+    optimal, ended, steps = info.get("optimal_steps"), False, 0
     while not ended:
         actions = player.act(observation)
         observation, reward, terminated, truncated, info = env.step(actions[0])
         ended, steps = terminated or truncated, steps + 1
         player.remember(actions, float(reward), ended)
     return Episode(info["is_success"], steps, optimal)
+
+
+def play_controller(
+    control: Callable[[NDArray[np.float32]], NDArray[np.float32]], env: gym.Env[Any, Any], seed: int, **options: Any
+) -> Episode:
+    """Run one episode with a controller that maps an observation to an action and remembers nothing."""
+    observation, info = env.reset(seed=seed, options=options)
+    ended, steps = False, 0
+    while not ended:
+        observation, _, terminated, truncated, info = env.step(control(observation))
+        ended, steps = terminated or truncated, steps + 1
+    return Episode(info["is_success"], steps, info.get("optimal_steps"))
 
 
 def play_batch(
