@@ -21,15 +21,16 @@ _ARM = (0, 1, 2, 3, 4, 5, 6)
 _FINGERS = (9, 10)
 _JOINTS = (*_ARM, *_FINGERS)
 _GRIPPER = 11
+_STILL = [0.0] * len(_JOINTS)
 _FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 120.0, 120.0, 170.0, 170.0)
 _NEUTRAL = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79, 0.0, 0.0)
 # Limits of the joints in the URDF, drawn in a little so that the motors do not work against the stops.
-_LOWER = np.array([-2.9671, -1.8326, -2.9671, -3.1416, -2.9671, -0.0873, -2.9671]) + 0.01
-_UPPER = np.array([2.9671, 1.8326, 2.9671, 0.0, 2.9671, 3.8223, 2.9671]) - 0.01
+_LOWER = tuple(low + 0.01 for low in (-2.9671, -1.8326, -2.9671, -3.1416, -2.9671, -0.0873, -2.9671))
+_UPPER = tuple(high - 0.01 for high in (2.9671, 1.8326, 2.9671, 0.0, 2.9671, 3.8223, 2.9671))
 # PyBullet's position motor removes this share of the error in each physics step of 1/240 s; see motor_gain. Stiffer
 # motors run into their torque limits and swing the arm off its line without arriving sooner.
 _GAIN_AT_240_HZ = 0.1
-_DAMPING = 1e-3
+_DAMPING = 1e-3 * np.eye(6)
 _POSTURE_GAIN = 0.1
 
 
@@ -64,7 +65,6 @@ class PandaRobot:
             )
         self._couple_fingers()
         self._gains = [motor_gain(time_step)] * len(_JOINTS)
-        self._neutral = np.array(_NEUTRAL[: len(_ARM)])
         self.position = self.velocity = (0.0, 0.0, 0.0)
         self.width = 0.0
         self.place()
@@ -90,20 +90,20 @@ class PandaRobot:
 
     def read(self) -> None:
         """Take over the state of the simulation; two calls of PyBullet in all."""
-        self._joints = [state[0] for state in pybullet.getJointStates(self.body, _JOINTS, physicsClientId=self.client)]
-        link = pybullet.getLinkState(self.body, _GRIPPER, computeLinkVelocity=True, physicsClientId=self.client)
+        self._joints = [state[0] for state in pybullet.getJointStates(self.body, _JOINTS, self.client)]
+        link = pybullet.getLinkState(self.body, _GRIPPER, True, False, self.client)
         self.position = link[0]
         self.velocity = link[6]
         self._orientation = link[1]
         self.width = self._joints[-1] + self._joints[-2]
 
-    def act(self, action: NDArray[np.float32]) -> None:
+    def act(self, action: Sequence[float]) -> None:
         """Set the motors for one action.
 
-        :param action: ``(4,)`` numbers in [-1, 1]: displacement along x, y, z in units of 5 cm and change of the
+        :param action: four numbers, clipped to [-1, 1]: displacement along x, y, z in units of 5 cm and change of the
             finger width in units of 20 cm, that is: open or close
         """
-        x, y, z, fingers = (min(1.0, max(-1.0, number)) for number in action.tolist())
+        x, y, z, fingers = [min(1.0, max(-1.0, number)) for number in action]
         # As in panda-gym the fingertips are not sent below the table.
         down = max(-self.position[2], z * MAX_DISPLACEMENT)
         angles = self._inverse_kinematics(x * MAX_DISPLACEMENT, y * MAX_DISPLACEMENT, down)
@@ -127,23 +127,22 @@ class PandaRobot:
         One step is exact to about 2 mm at 5 cm, and the next action starts from where the arm then is. What freedom
         is left pulls the arm towards its neutral pose, so that its posture hardly depends on the way it came.
         """
-        jacobian = np.array(self._jacobian())
+        jacobian = self._jacobian()
         # Rotation from the present orientation to (1, 0, 0, 0), pointing down, as a vector.
         qx, qy, qz, qw = self._orientation
         sign = math.copysign(2.0, qx)
-        error = np.array((x, y, z, sign * qw, sign * qz, -sign * qy))
-        angles = np.array(self._joints[: len(_ARM)])
-        posture = _POSTURE_GAIN * (self._neutral - angles)
-        gram = jacobian @ jacobian.T
-        gram.flat[::7] += _DAMPING
-        angles += posture + jacobian.T @ np.linalg.solve(gram, error - jacobian @ posture)
-        limited: list[float] = np.minimum(np.maximum(angles, _LOWER), _UPPER).tolist()
-        return limited
+        # A call of numpy costs more than a sum over seven joints, so only the matrices are arrays.
+        pull = [_POSTURE_GAIN * (neutral - angle) for neutral, angle in zip(_NEUTRAL, self._joints, strict=True)]
+        error = np.array((x, y, z, sign * qw, sign * qz, -sign * qy)) - jacobian.dot(pull)
+        change = np.linalg.solve(jacobian.dot(jacobian.T) + _DAMPING, error).dot(jacobian).tolist()
+        return [
+            min(high, max(low, angle + posture + step))
+            for angle, posture, step, low, high in zip(self._joints, pull, change, _LOWER, _UPPER, strict=False)
+        ]
 
-    def _jacobian(self) -> list[tuple[float, ...]]:
-        """Return the six rows of the gripper's Jacobian with respect to the arm's joints."""
-        still = [0.0] * len(_JOINTS)
+    def _jacobian(self) -> NDArray[np.float64]:
+        """Return the ``(6, 9)`` Jacobian of the gripper with respect to the joints; the fingers do not move it."""
         linear, angular = pybullet.calculateJacobian(
-            self.body, _GRIPPER, [0.0, 0.0, 0.0], self._joints, still, still, physicsClientId=self.client
+            self.body, _GRIPPER, _STILL[:3], self._joints, _STILL, _STILL, self.client
         )
-        return [row[: len(_ARM)] for row in (*linear, *angular)]
+        return np.array(linear + angular)
