@@ -21,7 +21,6 @@ from statistics import median
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import pybullet
 
 from progpolicy_envs import DOMAINS
