@@ -78,7 +78,8 @@ class Camera:
             view,
             projection,
             lightDirection=[0.6, 0.9, 2.0],
-            shadow=1,
+            # Shadows would double the time and only darken whole faces of the table and the floor.
+            shadow=0,
             renderer=pybullet.ER_TINY_RENDERER,
             physicsClientId=self.scene.client,
         )[2]
