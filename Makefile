@@ -7,11 +7,12 @@ SOURCES := sb3_progpolicy envs examples benchmarks tests docs
 # Networks this small run faster on one thread each, and the tests on one process per core.
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 
-.PHONY: help install demo test lint format bench docs clean
+.PHONY: help install demo test test-long lint format bench docs clean
 
 help:
 	@echo "make demo     train on 1-4 discs, print the program and a table for 1-8 discs"
 	@echo "make test     run the tests"
+	@echo "make test-long  run the tests that take minutes: 100 000 random actions on each Panda task"
 	@echo "make lint     ruff and mypy;  make format  applies ruff's fixes"
 	@echo "make bench    measure speed: training against Stable-Baselines3, environments batched and in processes"
 	@echo "make docs     build the documentation into docs/_build/html"
@@ -31,6 +32,9 @@ demo: $(INSTALLED)
 test: $(INSTALLED)
 	$(ONE_THREAD) $(BIN)/python -m pytest -n 2
 
+test-long: $(INSTALLED)
+	$(ONE_THREAD) $(BIN)/python -m pytest -n 2 -m slow
+
 lint: $(INSTALLED)
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/ruff format --check $(SOURCES)
@@ -44,6 +48,7 @@ bench: $(INSTALLED)
 	$(ONE_THREAD) $(BIN)/python benchmarks/training_speed.py
 	$(ONE_THREAD) $(BIN)/python benchmarks/recurrence.py
 	$(ONE_THREAD) $(BIN)/python benchmarks/envs_speed.py
+	$(ONE_THREAD) $(BIN)/python benchmarks/panda_speed.py
 	$(ONE_THREAD) $(BIN)/python benchmarks/vec_env_speed.py
 
 docs: $(INSTALLED)

@@ -1,30 +1,47 @@
 """Steps per second of many environments in few processes, against SB3's one process per environment.
 
-    python benchmarks/vec_env_speed.py [--env PandaReach-v0] [--num-envs 16] [--workers 2] [--seconds 2.0] [--rounds 5]
+    python benchmarks/vec_env_speed.py [--env PandaReach-v0 ...] [--num-envs 16] [--workers 2] [--rounds 5]
 
-Random actions, environments seeded alike. In every round each candidate runs for the given time, one after the other,
-so that a busy machine slows all of them alike; the table shows medians over the rounds and ratios of them.
+Random actions, environments seeded alike. In every round each candidate runs for the given time, one after the other;
+the table shows medians over the rounds and ratios of them. On a machine that does other work as well, sixteen processes
+get a larger share of it than two do. The processor time that all processes together spend on a step, read from /proc
+where there is one, does not depend on that.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import time
+from pathlib import Path
 from statistics import median
 
 import numpy as np
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
-import progpolicy_envs  # noqa: F401 (registers the ids)
+from progpolicy_envs import DOMAINS
 from sb3_progpolicy.grouped import GroupedSubprocVecEnv
 
+TASKS = [domain.id for domain in DOMAINS.values() if domain.simulation]
 
-def steps_per_second(env: VecEnv, seconds: float) -> float:
-    """Step with random actions for about so many seconds; return steps of all environments per second."""
+
+def processor_seconds(env: VecEnv) -> float:
+    """Return the processor time that this process and the workers of an environment have used so far."""
+    ticks = 0
+    for process in getattr(env, "processes", []):
+        stat = Path(f"/proc/{process.pid}/stat")
+        if stat.exists():
+            user, system = stat.read_text().rpartition(")")[2].split()[11:13]
+            ticks += int(user) + int(system)
+    return time.process_time() + ticks / os.sysconf("SC_CLK_TCK")
+
+
+def measure(env: VecEnv, seconds: float) -> tuple[float, float]:
+    """Step with random actions for so many seconds; return steps per second and processor seconds per step."""
     rng = np.random.default_rng(0)
     low, high = getattr(env.action_space, "low", None), getattr(env.action_space, "high", None)
-    steps, start = 0, time.perf_counter()
+    steps, used, start = 0, processor_seconds(env), time.perf_counter()
     while (elapsed := time.perf_counter() - start) < seconds:
         if low is None:
             actions = np.array([env.action_space.sample() for _ in range(env.num_envs)])
@@ -32,21 +49,30 @@ def steps_per_second(env: VecEnv, seconds: float) -> float:
             actions = rng.uniform(low, high, (env.num_envs, *low.shape)).astype(np.float32)
         env.step(actions)
         steps += env.num_envs
-    return steps / elapsed
+    return steps / elapsed, (processor_seconds(env) - used) / steps
 
 
 def main() -> None:
     """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", default="PandaReach-v0", help="environment id")
+    parser.add_argument("--env", nargs="+", default=list(TASKS), help="environment ids")
     parser.add_argument("--num-envs", type=int, default=16, help="environments")
     parser.add_argument("--workers", type=int, default=2, help="processes of the grouped form")
     parser.add_argument("--seconds", type=float, default=2.0, help="how long each candidate runs in a round")
     parser.add_argument("--rounds", type=int, default=5, help="rounds of which the median is taken")
     options = parser.parse_args()
+    print(
+        f"{options.num_envs} environments, median of {options.rounds} interleaved rounds of {options.seconds:g} s\n\n"
+        f"{'':<16}{'form':<24}{'processes':>10}{'steps/s':>10}{'ratio':>8}{'processor, ms/step':>20}{'ratio':>8}"
+    )
+    for env_id in options.env:
+        print_rows(env_id, options)
 
+
+def print_rows(env_id: str, options: argparse.Namespace) -> None:
+    """Measure the three forms with one environment id and print a row for each."""
     envs: dict[str, VecEnv] = {}
-    measured: dict[str, list[float]] = {}
+    measured: dict[str, list[tuple[float, float]]] = {}
     forms: dict[str, tuple[type[VecEnv], dict[str, int]]] = {
         "DummyVecEnv": (DummyVecEnv, {}),
         "SubprocVecEnv": (SubprocVecEnv, {}),
@@ -54,25 +80,24 @@ def main() -> None:
     }
     try:
         for name, (form, arguments) in forms.items():
-            envs[name] = make_vec_env(options.env, options.num_envs, seed=0, vec_env_cls=form, vec_env_kwargs=arguments)
+            envs[name] = make_vec_env(env_id, options.num_envs, seed=0, vec_env_cls=form, vec_env_kwargs=arguments)
             envs[name].reset()
             measured[name] = []
         for _ in range(options.rounds):
             for name, env in envs.items():
-                measured[name].append(steps_per_second(env, options.seconds))
+                measured[name].append(measure(env, options.seconds))
     finally:
         for env in envs.values():
             env.close()
-
-    speed = {name: median(values) for name, values in measured.items()}
-    print(
-        f"{options.env}, {options.num_envs} environments, median of {options.rounds} interleaved rounds of "
-        f"{options.seconds:g} s\n"
-    )
-    print(f"{'form':<24}{'processes':>10}{'steps/s':>12}{'ratio':>8}")
+    results = {name: [median(values) for values in zip(*rounds, strict=True)] for name, rounds in measured.items()}
     processes = {"DummyVecEnv": 1, "SubprocVecEnv": options.num_envs, "GroupedSubprocVecEnv": options.workers}
-    for name, value in speed.items():
-        print(f"{name:<24}{processes[name]:>10}{value:>12,.0f}{value / speed['SubprocVecEnv']:>8.2f}")
+    speed, used = results["SubprocVecEnv"]
+    for name, (steps, seconds) in results.items():
+        print(
+            f"{env_id:<16}{name:<24}{processes[name]:>10}{steps:>10,.0f}{steps / speed:>8.2f}"
+            f"{1000 * seconds:>20.2f}{seconds / used:>8.2f}",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ python_use_unqualified_type_names = True
 
 ENVIRONMENTS = Path(__file__).parent / "environments"
 IMAGES = Path(__file__).parent / "images"
+CONTROLLERS = Path(__file__).parents[1] / "benchmarks" / "results" / "panda_control.md"
 
 
 def environment_page(env_id: str) -> str:
@@ -43,7 +44,20 @@ def environment_page(env_id: str) -> str:
     lines += [inspect.getdoc(creator) or "", "", "## Variations", ""]
     for words, variations in (("Training", domain.train), ("Unseen in training, to test on", domain.unseen)):
         lines += [f"{words}:", "", *(f"* `{variation}`" for variation in variations), ""]
-    return "\n".join(lines)
+    return "\n".join(lines + controller_figures(env_id))
+
+
+def controller_figures(env_id: str) -> list[str]:
+    """Return how often the scripted controller solves a Panda task, or nothing for the other domains."""
+    if not DOMAINS[env_id].simulation:
+        return []
+    command, commit, *table = [line for line in CONTROLLERS.read_text(encoding="utf-8").splitlines() if line]
+    rows = [line for line in table if line.startswith(("| Task ", "|---", f"| {env_id} "))]
+    words = (
+        "How often the scripted controller (`progpolicy_envs.planners.panda`) solves the task, with our physics and "
+        "with the finer ones of panda-gym, 500 Hz and 20 physics steps for each action, from the same starts:"
+    )
+    return ["## Scripted controller", "", words, "", *rows, "", f"{command} {commit}", ""]
 
 
 def page_name(env_id: str) -> str:

@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 
+import gymnasium as gym
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -110,6 +112,19 @@ def test_the_planner_of_every_planning_domain_is_rendered_to_its_goal(tmp_path, 
     assert "goal reached" in message
     with Image.open(file) as picture:
         assert f"{picture.n_frames - 1} steps" in message
+
+
+@pytest.mark.parametrize(("env_id", "size"), [("Stacking-v0", "n_plates=8"), ("PandaPush-v0", "n_objects=8")])
+def test_colours_of_small_things_survive_in_the_animation(tmp_path, env_id, size):
+    file = tmp_path / "a.gif"
+    assert run(["render", env_id, "--random", "-o", str(file), "--set", size, "--max-steps", "1", "--seed", "0"]) == 0
+    name, number = size.split("=")
+    env = gym.make(env_id, render_mode="rgb_array")
+    env.reset(seed=0, options={name: int(number)})
+    with Image.open(file) as picture:
+        difference = np.asarray(picture.convert("RGB")).astype(int) - env.render()
+    env.close()
+    assert np.abs(difference).max() <= 10
 
 
 @pytest.mark.parametrize(("actor", "cap"), [("--planner", "30"), ("--random", "3")])

@@ -171,7 +171,8 @@ class _Animation:
         except ImportError:
             raise ValueError('render needs Pillow: pip install "sb3-progpolicy[render]"') from None
         self._image = Image
-        self.frames = [Image.fromarray(frame).quantize(64)]
+        # The default method gives a small thing, such as a plate, the colour of a larger one that looks like it.
+        self.frames = [Image.fromarray(frame).quantize(256, Image.Quantize.MAXCOVERAGE)]
 
     def add(self, frame: Any) -> None:
         image = self._image.fromarray(frame)

@@ -14,6 +14,7 @@ from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 import progpolicy_envs
+from progpolicy_envs.panda.robot import arm_angles
 from progpolicy_envs.panda.scene import Physics, Scene
 from progpolicy_envs.panda.tasks import Push, Slide, Stack
 from progpolicy_envs.planners.panda import CONTROLLERS
@@ -208,6 +209,49 @@ def test_sliding_puck_counts_once_inside_its_disc_and_leaves_the_table():
     assert not terminated
     assert not info["is_success"]
     assert scene.positions[0][0] > 5
+
+
+def gripper_with(scene: Scene, angles: list[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return position and orientation of the gripper at arm angles."""
+    for joint, angle in enumerate(angles):
+        pybullet.resetJointState(scene.robot.body, joint, angle, 0.0, scene.client)
+    link = pybullet.getLinkState(scene.robot.body, 11, False, True, scene.client)
+    return np.array(link[0]), np.array(link[1])
+
+
+def test_arm_angles_bring_the_gripper_exactly_where_it_shall_be_pointing_down():
+    scene = Scene(Push.table, None)
+    for place in np.random.default_rng(0).uniform((-0.3, -0.3, 0.0), (0.1, 0.3, 0.3), (50, 3)):
+        position, orientation = gripper_with(scene, arm_angles(*place))
+        assert position == pytest.approx(place, abs=1e-6)
+        assert np.abs(orientation) == pytest.approx((1, 0, 0, 0), abs=1e-6)
+    scene.close()
+
+
+@pytest.mark.parametrize(
+    "place", [(2.0, 0.5, 0.1), (-0.6, 0.0, 0.2), (-0.5, 0.0, 1.5), (-1.2, 0.1, 0.0), (-0.4, 0.0, -3.0)]
+)
+def test_arm_angles_stay_within_the_limits_where_the_arm_cannot_reach(place):
+    scene = Scene(Push.table, None)
+    for joint, angle in enumerate(arm_angles(*place)):
+        low, high = pybullet.getJointInfo(scene.robot.body, joint, scene.client)[8:10]
+        assert low < angle < high
+    scene.close()
+
+
+@pytest.mark.parametrize("direction", [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, 0, 1), (0.7, -0.7, 0)])
+def test_gripper_goes_straight_where_the_action_says(direction):
+    env = make("PandaReach-v0", 8)
+    env.reset(seed=0)
+    robot = env.unwrapped.scene.robot
+    env.step(np.array([*direction, 0], np.float32))
+    begin = np.array(robot.position)
+    for _ in range(4):
+        env.step(np.array([*direction, 0], np.float32))
+    way = np.array(robot.position) - begin
+    along = way @ np.array(direction) / np.linalg.norm(direction)
+    assert along > 4 * 0.5 * 0.05 * np.linalg.norm(direction) * 0.85
+    assert np.linalg.norm(way - along * np.array(direction) / np.linalg.norm(direction)) < 0.05 * along
 
 
 def settle(scene: Scene, seconds: float) -> np.ndarray:

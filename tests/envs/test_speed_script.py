@@ -1,4 +1,4 @@
-"""The speed measurement runs and prints its table."""
+"""The speed measurements run and print their tables."""
 
 import os
 import re
@@ -6,7 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-SCRIPT = Path(__file__).parents[2] / "benchmarks" / "envs_speed.py"
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+SCRIPT = BENCHMARKS / "envs_speed.py"
 
 
 def test_speed_script_prints_a_ratio_for_every_planning_domain() -> None:
@@ -16,3 +17,19 @@ def test_speed_script_prints_a_ratio_for_every_planning_domain() -> None:
     rows = re.findall(r"^(\S+-v0(?:, \w+)?)\s+([\d,]+)\s+([\d,]+)\s+([\d,]+)", result.stdout, flags=re.MULTILINE)
     assert [row[0] for row in rows] == ["Hanoi-v0", "Hiking-v0, map", "Hiking-v0, egocentric", "Stacking-v0"]
     assert all(int(ratio.replace(",", "")) > 5 for *_, ratio in rows), result.stdout
+
+
+def test_panda_speed_script_does_without_panda_gym_and_says_so() -> None:
+    script = str(BENCHMARKS / "panda_speed.py")
+    # A module that is None in sys.modules can't be imported, as if it were not installed.
+    program = (
+        f"import runpy, sys; sys.modules['panda_gym'] = None; sys.argv[0] = {script!r}; "
+        f"runpy.run_path({script!r}, run_name='__main__')"
+    )
+    command = [sys.executable, "-c", program, "--blocks", "1", "--rounds", "1"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    result = subprocess.run(command, capture_output=True, text=True, timeout=240, check=True, env=environment)
+    rows = re.findall(r"^(Panda\w+) +([\d,]+) .*%", result.stdout, flags=re.MULTILINE)
+    assert [task for task, _ in rows] == ["PandaReach", "PandaPush", "PandaSlide", "PandaStack"]
+    assert "panda-gym is not installed" in result.stdout
+    assert "peers" in result.stdout

@@ -6,7 +6,7 @@ import numpy as np
 import pybullet
 
 from progpolicy_envs.panda.scene import MAX_OBJECTS, Scene
-from progpolicy_envs.panda.tasks import Reach, Stack, Task
+from progpolicy_envs.panda.tasks import Reach, Slide, Stack, Task
 from progpolicy_envs.rendering import Frame
 
 WIDTH, HEIGHT = 480, 360
@@ -45,6 +45,8 @@ class Camera:
         for body, colour in zip(scene.objects, COLOURS, strict=False):
             pybullet.changeVisualShape(body, -1, rgbaColor=[*colour, 1], physicsClientId=scene.client)
         self._targets = [self._target(colour) for colour in COLOURS]
+        # A delivered puck is off the table; the picture still shows it where it was delivered.
+        self._delivered = [self._puck(colour) for colour in COLOURS] if isinstance(task, Slide) else []
         self._pins = [self._pin() for _ in range(1 if isinstance(task, Reach) else 2)]
         self._floor = self._ghost(pybullet.GEOM_BOX, [0.55, 0.6, 0.64, 1.0], halfExtents=[3, 3, 0.01])
         self._put(self._floor, (0.0, 0.0, -0.42))
@@ -58,6 +60,9 @@ class Camera:
         for index, ghost in enumerate(self._targets[:MAX_OBJECTS]):
             shown = index < len(task.targets) and not (isinstance(task, Reach) and task.finished[index])
             self._put(ghost, self._target_position(index) if shown else _AWAY)
+        for index, ghost in enumerate(self._delivered):
+            shown = index < len(task.targets) and task.finished[index]
+            self._put(ghost, task.positions[index] if shown else _AWAY)
         marked = [self._target_position(focus)]
         if not isinstance(task, Reach):
             marked.append(task.positions[focus])
@@ -73,7 +78,8 @@ class Camera:
             view,
             projection,
             lightDirection=[0.6, 0.9, 2.0],
-            shadow=1,
+            # Shadows would double the time and only darken whole faces of the table and the floor.
+            shadow=0,
             renderer=pybullet.ER_TINY_RENDERER,
             physicsClientId=self.scene.client,
         )[2]
@@ -82,6 +88,10 @@ class Camera:
     def _pin(self) -> tuple[int, int]:
         head = self._ghost(pybullet.GEOM_SPHERE, [*MARKER_COLOUR, 1.0], radius=0.012)
         return head, self._ghost(pybullet.GEOM_CYLINDER, [*MARKER_COLOUR, 1.0], radius=0.0035, length=0.06)
+
+    def _puck(self, colour: tuple[float, float, float]) -> int:
+        radius, _, half_height = Slide.kind.half_extents
+        return self._ghost(pybullet.GEOM_CYLINDER, [*colour, 1.0], radius=radius, length=2 * half_height)
 
     def _target(self, colour: tuple[float, float, float]) -> int:
         if isinstance(self.task, Reach):

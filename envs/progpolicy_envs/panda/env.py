@@ -127,11 +127,12 @@ class PandaEnv(gym.Env[Any, NDArray[np.float32]]):
         :raises ValueError: if the action has another shape or a number that is not finite
         """
         action = np.asarray(action, dtype=np.float32)
-        if action.shape != self.action_space.shape or not np.isfinite(action).all():
+        numbers = action.tolist()
+        if action.shape != (len(ACTION_NAMES),) or not all(map(math.isfinite, numbers)):
             raise ValueError(f"action={action!r} is not accepted; an action is 4 finite numbers from -1 to 1")
         task, index, achieved, n_left = self.task, self._focus, self._achieved, self._n_left
         reach = self._reach
-        self.scene.robot.act(action)
+        self.scene.robot.act(numbers)
         self.scene.step()
         task.update(self.scene)
         shaping = STEP + APPROACH * (reach - self._handle_distance(index)) + FAILURE * task.failed

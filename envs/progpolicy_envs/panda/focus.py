@@ -69,4 +69,6 @@ def focus_observation(robot: PandaRobot, state: ObjectState, target: Point, n_le
         *(x, y, z),
         *(tx, ty, tz),
     )
-    return np.minimum(np.maximum(np.array(features, dtype=np.float32), -BOUND), BOUND)
+    if max(features) > BOUND or min(features) < -BOUND:
+        features = tuple(max(-BOUND, min(BOUND, number)) for number in features)
+    return np.array(features, dtype=np.float32)

@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import numpy as np
 import pybullet
-from numpy.typing import NDArray
 
 BASE_POSITION = (-0.6, 0.0, 0.0)
 #: Largest displacement of the gripper that one action asks for, metres.
@@ -24,13 +22,18 @@ _GRIPPER = 11
 _FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 120.0, 120.0, 170.0, 170.0)
 _NEUTRAL = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79, 0.0, 0.0)
 # Limits of the joints in the URDF, drawn in a little so that the motors do not work against the stops.
-_LOWER = np.array([-2.9671, -1.8326, -2.9671, -3.1416, -2.9671, -0.0873, -2.9671]) + 0.01
-_UPPER = np.array([2.9671, 1.8326, 2.9671, 0.0, 2.9671, 3.8223, 2.9671]) - 0.01
+_LOWER = tuple(low + 0.01 for low in (-2.9671, -1.8326, -2.9671, -3.1416, -2.9671, -0.0873, -2.9671))
+_UPPER = tuple(high - 0.01 for high in (2.9671, 1.8326, 2.9671, 0.0, 2.9671, 3.8223, 2.9671))
 # PyBullet's position motor removes this share of the error in each physics step of 1/240 s; see motor_gain. Stiffer
 # motors run into their torque limits and swing the arm off its line without arriving sooner.
 _GAIN_AT_240_HZ = 0.1
-_DAMPING = 1e-3
-_POSTURE_GAIN = 0.1
+# Lengths of the arm in the URDF, metres: height of the shoulder; upper arm and forearm, with the elbow's offset from
+# both; from the wrist's axis to the hand's and down to the fingertips.
+_SHOULDER, _UPPER_ARM, _FOREARM, _ELBOW, _WRIST, _HAND = 0.333, 0.316, 0.384, 0.0825, 0.088, 0.212
+_TO_ELBOW, _TO_WRIST = math.hypot(_UPPER_ARM, _ELBOW), math.hypot(_FOREARM, _ELBOW)
+_ELBOW_ANGLES = math.atan2(_ELBOW, _UPPER_ARM), math.atan2(_ELBOW, _FOREARM)
+# The gripper keeps this far from the axis on which the arm turns, where small ways would be large turns.
+_NEAREST = 0.2
 
 
 def motor_gain(time_step: float) -> float:
@@ -42,6 +45,36 @@ def motor_gain(time_step: float) -> float:
     :param time_step: seconds
     """
     return 1 - (1 - _GAIN_AT_240_HZ) ** (240 * time_step)
+
+
+def arm_angles(x: float, y: float, z: float) -> list[float]:
+    """Return the arm's joint angles that bring the gripper to a place, pointing down, its fingers opening along y.
+
+    Of the seven joints the third and the fifth stay at 0. The arm then moves in a vertical plane, where shoulder, elbow
+    and wrist form a triangle: the solution is exact and the same whatever way the arm came. Places out of reach are
+    drawn in along the line to the shoulder.
+
+    :param x: metres
+    :param y: metres
+    :param z: metres above the table
+    :return: seven angles within the joints' limits, radians
+    """
+    x, y = x - BASE_POSITION[0], y - BASE_POSITION[1]
+    turn = math.atan2(y, x)
+    out, up = max(_NEAREST, math.hypot(x, y)) - _WRIST, z + _HAND - _SHOULDER
+    span = math.hypot(out, up)
+    at_elbow = _corner(_TO_ELBOW, _TO_WRIST, span)
+    at_shoulder = _corner(_TO_ELBOW, span, _TO_WRIST)
+    shoulder = math.atan2(out, up) - at_shoulder - _ELBOW_ANGLES[0]
+    elbow = at_elbow - math.pi - sum(_ELBOW_ANGLES)
+    angles = (turn, shoulder, 0.0, elbow, 0.0, shoulder - elbow, turn + math.pi / 4)
+    return [min(high, max(low, angle)) for angle, low, high in zip(angles, _LOWER, _UPPER, strict=True)]
+
+
+def _corner(one: float, other: float, opposite: float) -> float:
+    """Return the angle between two sides of a triangle, 0 or pi where the third is too short or too long for one."""
+    cosine = (one * one + other * other - opposite * opposite) / (2 * one * other)
+    return math.acos(min(1.0, max(-1.0, cosine)))
 
 
 class PandaRobot:
@@ -64,7 +97,6 @@ class PandaRobot:
             )
         self._couple_fingers()
         self._gains = [motor_gain(time_step)] * len(_JOINTS)
-        self._neutral = np.array(_NEUTRAL[: len(_ARM)])
         self.position = self.velocity = (0.0, 0.0, 0.0)
         self.width = 0.0
         self.place()
@@ -90,23 +122,23 @@ class PandaRobot:
 
     def read(self) -> None:
         """Take over the state of the simulation; two calls of PyBullet in all."""
-        self._joints = [state[0] for state in pybullet.getJointStates(self.body, _JOINTS, physicsClientId=self.client)]
-        link = pybullet.getLinkState(self.body, _GRIPPER, computeLinkVelocity=True, physicsClientId=self.client)
+        (left, *_), (right, *_) = pybullet.getJointStates(self.body, _FINGERS, self.client)
+        link = pybullet.getLinkState(self.body, _GRIPPER, True, False, self.client)
         self.position = link[0]
         self.velocity = link[6]
-        self._orientation = link[1]
-        self.width = self._joints[-1] + self._joints[-2]
+        self.width = left + right
 
-    def act(self, action: NDArray[np.float32]) -> None:
+    def act(self, action: Sequence[float]) -> None:
         """Set the motors for one action.
 
-        :param action: ``(4,)`` numbers in [-1, 1]: displacement along x, y, z in units of 5 cm and change of the
+        :param action: four numbers, clipped to [-1, 1]: displacement along x, y, z in units of 5 cm and change of the
             finger width in units of 20 cm, that is: open or close
         """
-        x, y, z, fingers = (min(1.0, max(-1.0, number)) for number in action.tolist())
+        x, y, z, fingers = [min(1.0, max(-1.0, number)) for number in action]
+        px, py, pz = self.position
         # As in panda-gym the fingertips are not sent below the table.
-        down = max(-self.position[2], z * MAX_DISPLACEMENT)
-        angles = self._inverse_kinematics(x * MAX_DISPLACEMENT, y * MAX_DISPLACEMENT, down)
+        height = max(0.0, pz + z * MAX_DISPLACEMENT)
+        angles = arm_angles(px + x * MAX_DISPLACEMENT, py + y * MAX_DISPLACEMENT, height)
         finger = max(0.0, min(MAX_WIDTH, self.width + fingers * MAX_WIDTH_CHANGE)) / 2
         self._drive((*angles, finger, finger))
 
@@ -120,30 +152,3 @@ class PandaRobot:
             positionGains=self._gains,
             physicsClientId=self.client,
         )
-
-    def _inverse_kinematics(self, x: float, y: float, z: float) -> list[float]:
-        """Return arm angles for a displacement of the gripper, by one damped least-squares step.
-
-        One step is exact to about 2 mm at 5 cm, and the next action starts from where the arm then is. What freedom
-        is left pulls the arm towards its neutral pose, so that its posture hardly depends on the way it came.
-        """
-        jacobian = np.array(self._jacobian())
-        # Rotation from the present orientation to (1, 0, 0, 0), pointing down, as a vector.
-        qx, qy, qz, qw = self._orientation
-        sign = math.copysign(2.0, qx)
-        error = np.array((x, y, z, sign * qw, sign * qz, -sign * qy))
-        angles = np.array(self._joints[: len(_ARM)])
-        posture = _POSTURE_GAIN * (self._neutral - angles)
-        gram = jacobian @ jacobian.T
-        gram.flat[::7] += _DAMPING
-        angles += posture + jacobian.T @ np.linalg.solve(gram, error - jacobian @ posture)
-        limited: list[float] = np.minimum(np.maximum(angles, _LOWER), _UPPER).tolist()
-        return limited
-
-    def _jacobian(self) -> list[tuple[float, ...]]:
-        """Return the six rows of the gripper's Jacobian with respect to the arm's joints."""
-        still = [0.0] * len(_JOINTS)
-        linear, angular = pybullet.calculateJacobian(
-            self.body, _GRIPPER, [0.0, 0.0, 0.0], self._joints, still, still, physicsClientId=self.client
-        )
-        return [row[: len(_ARM)] for row in (*linear, *angular)]

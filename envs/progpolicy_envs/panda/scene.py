@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import pybullet
 import pybullet_data
@@ -82,8 +82,7 @@ class ObjectKind:
         return self.half_extents[2]
 
 
-@dataclass(frozen=True)
-class ObjectState:
+class ObjectState(NamedTuple):
     """One object. All in metres, seconds and radians.
 
     :param position: ``(3,)``
@@ -230,13 +229,13 @@ class Scene:
         self._set_iterations()
         step, client = pybullet.stepSimulation, self.client
         for _ in range(self.physics.substeps):
-            step(physicsClientId=client)
+            step(client)
         self.read()
 
     def _set_iterations(self) -> None:
         if self.kind is None or not self.positions:
             return
-        highest = max(position[2] for position in self.positions)
+        highest = max([position[2] for position in self.positions])
         levels = min(MAX_LEVELS, max(1, round(highest / (2 * self.kind.height) + 0.5)))
         if levels != self._levels:
             self._levels = levels

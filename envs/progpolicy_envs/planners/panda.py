@@ -69,9 +69,10 @@ def push(observation: Observation) -> Action:
 
 
 def slide(observation: Observation) -> Action:
-    """Take the puck between the half-open fingers from behind, accelerate it towards its target and stop.
+    """Take the puck between the half-open fingers from behind, make it faster and faster along the line, and stop.
 
-    The two fingers keep the puck in their middle, so that it leaves in the direction in which the gripper goes.
+    The two fingers keep the puck in their middle, so that it leaves in the direction in which the gripper goes. A hard
+    push would make it jump out of the fingers before it has taken that direction.
 
     :param observation: ``(32,)``
     :return: ``(4,)``
@@ -82,11 +83,13 @@ def slide(observation: Observation) -> Action:
     down = 0.012 - height
     fingers = (0.04 - view.width) / 0.2
     outside = math.hypot(view.gripper[0] + 0.6, view.gripper[1]) > 0.69
-    moving = math.hypot(*view.object_velocity[:2]) > 0.05
+    speed = math.hypot(*view.object_velocity[:2])
+    moving = speed > 0.05
     if height < 0.03 and 0.0 < dx < 0.08 and abs(dy) < 0.03 and not outside:
         if not moving:
             return _action(0.015, dy, down, fingers)
-        return _action(0.045 * view.line[0], 0.045 * view.line[1] + 0.3 * dy, down, fingers)
+        forward = min(_STEP, 0.02 + 0.0375 * speed)
+        return _action(forward * view.line[0], forward * view.line[1] + 0.4 * dy, down, fingers)
     if moving or (outside and height < 0.07):
         return _action(0.0, 0.0, _CLEAR - height, fingers)
     if abs(dx - 0.06) < 0.012 and abs(dy) < 0.008:

@@ -1,0 +1,173 @@
+"""Steps per second of the Panda tasks: against panda-gym, against their own bare physics, eight objects against one.
+
+    python benchmarks/panda_speed.py [--blocks 4] [--rounds 9]
+
+Random actions, one environment, one core. A block is a reset, not timed, and 50 steps, which is panda-gym's episode.
+Seconds are of processor time, and in every round each candidate runs its blocks one after the other, so that a busy
+machine slows all of them alike; the table shows medians over the rounds, of the ratios too.
+
+The bare physics are the same blocks once more with nothing but the motor commands and the calls of
+``stepSimulation``, recorded before: the arm and the objects move as with the environment, to the last bit.
+panda-gym's Stack has two blocks, so there ours has two as well. Its step is 1/25 s, ours 1/30 s.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from statistics import median
+from typing import Any
+
+import gymnasium as gym
+import pybullet
+
+from progpolicy_envs import DOMAINS
+
+STEPS = 50
+TASKS = ("PandaReach", "PandaPush", "PandaSlide", "PandaStack")
+MISSING = (
+    "panda-gym is not installed, so its columns are empty; it is in the extra `peers`: "
+    'pip install "sb3-progpolicy[peers]", or panda-gym alone'
+)
+#: Runs a block and returns the seconds of its reset and of its steps.
+Block = Callable[[int], tuple[float, float]]
+
+
+def block_runner(env: gym.Env[Any, Any]) -> Block:
+    """Return a runner of seeded blocks with random actions."""
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(STEPS)]
+
+    def run(seed: int) -> tuple[float, float]:
+        start = time.process_time()
+        env.reset(seed=seed)
+        reset = time.process_time()
+        for action in actions:
+            env.step(action)
+        return reset - start, time.process_time() - reset
+
+    return run
+
+
+def ours(task: str, size: int) -> gym.Env[Any, Any]:
+    """Return one of our environments without Gymnasium's checks."""
+    domain = DOMAINS[f"{task}-v0"]
+    return made(domain.id, **{domain.size: size})
+
+
+def made(env_id: str, **arguments: Any) -> gym.Env[Any, Any]:
+    """Make an environment; panda-gym's have the same names as ours and version 3, which Gymnasium takes for newer."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        return gym.make(env_id, disable_env_checker=True, **arguments)
+
+
+def physics_runner(env: gym.Env[Any, Any]) -> Block:
+    """Return a runner of the same blocks as :func:`block_runner`'s in which only the physics are computed."""
+    world, run = env.unwrapped.scene, block_runner(env)  # type: ignore[attr-defined]
+    command = pybullet.setJointMotorControlArray
+    recorded: dict[int, list[tuple[Any, Any]]] = {}
+    ends: dict[int, Any] = {}
+
+    def record(seed: int) -> None:
+        commands = recorded[seed] = []
+
+        def recording(*args: Any, **kwargs: Any) -> None:
+            commands.append((args, kwargs))
+            command(*args, **kwargs)
+
+        pybullet.setJointMotorControlArray = recording
+        try:
+            run(seed)
+        finally:
+            pybullet.setJointMotorControlArray = command
+        del commands[:-STEPS]  # those of the reset
+        ends[seed] = world.robot.position, world.positions
+
+    def replay(seed: int) -> tuple[float, float]:
+        if seed not in recorded:
+            record(seed)
+        env.reset(seed=seed)
+        step, client, substeps = pybullet.stepSimulation, world.client, range(world.physics.substeps)
+        start = time.process_time()
+        for args, kwargs in recorded[seed]:
+            command(*args, **kwargs)
+            for _ in substeps:
+                step(client)
+        seconds = time.process_time() - start
+        world.read()
+        if (world.robot.position, world.positions) != ends[seed]:
+            raise RuntimeError(f"the bare physics went another way than {env} from seed {seed}")
+        return 0.0, seconds
+
+    return replay
+
+
+def panda_gym_is_installed() -> bool:
+    """Import panda-gym, which registers its ids; return whether that was possible."""
+    try:
+        import panda_gym  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+def measure(runners: dict[str, Block], blocks: int, rounds: int) -> dict[str, list[tuple[float, float]]]:
+    """Return for each candidate the seconds per reset and per step of each round."""
+    for run in runners.values():
+        for seed in range(blocks):
+            run(seed)
+    measured: dict[str, list[tuple[float, float]]] = {name: [] for name in runners}
+    for _ in range(rounds):
+        for name, run in runners.items():
+            resets, steps = zip(*(run(seed) for seed in range(blocks)), strict=True)
+            measured[name].append((sum(resets) / blocks, sum(steps) / blocks / STEPS))
+    return measured
+
+
+def ratio(numerators: Sequence[tuple[float, float]], denominators: Sequence[tuple[float, float]]) -> float:
+    """Return the median over the rounds of the ratio of the seconds per step."""
+    return median(one[1] / other[1] for one, other in zip(numerators, denominators, strict=True))
+
+
+def table_row(task: str, blocks: int, rounds: int) -> str:
+    """Measure a task and return its row."""
+    one, other = ours(task, 1), made(f"{task}-v3") if panda_gym_is_installed() else None
+    runners = {"one": block_runner(one), "physics": physics_runner(one), "eight": block_runner(ours(task, 8))}
+    if other is not None:
+        runners["equal"] = block_runner(ours(task, 2)) if task == "PandaStack" else runners["one"]
+        runners["peer"] = block_runner(other)
+    measured = measure(runners, blocks, rounds)
+    rate = {name: 1 / median(step for _, step in values) for name, values in measured.items()}
+    resets = [1000 * median(reset for reset, _ in measured[name]) for name in ("one", "eight")]
+    share = ratio(measured["physics"], measured["one"])
+    row = f"{task:<12}{rate['one']:>8,.0f}{rate['eight']:>8,.0f}{ratio(measured['eight'], measured['one']):>8.2f}"
+    row += f"{rate['physics']:>10,.0f}{share:>8.0%}"
+    if other is None:
+        row += f"{'-':>11}{'-':>8}"
+    else:
+        row += f"{rate['peer']:>11,.0f}{ratio(measured['peer'], measured['equal']):>8.2f}"
+    return row + f"{resets[0]:>11.1f}{resets[1]:>8.1f}"
+
+
+def main() -> None:
+    """Measure and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--blocks", type=int, default=4, help="blocks of 50 steps for each candidate in a round")
+    parser.add_argument("--rounds", type=int, default=9, help="rounds of which the median is taken")
+    options = parser.parse_args()
+    rows = [table_row(task, options.blocks, options.rounds) for task in TASKS]
+    print(f"steps/s, median of {options.rounds} interleaved rounds of {options.blocks} x {STEPS} steps\n")
+    print(f"{'':<12}{'1 object':>8}{'8':>8}{'cost':>8}{'physics':>10}{'share':>8}{'panda-gym':>11}{'ratio':>8}", end="")
+    print(f"{'reset, ms':>11}{'8':>8}")
+    print(*rows, sep="\n")
+    print("\ncost: a step with 8 objects against one with 1; share: of a step's time that is bare physics;")
+    print("ratio: our steps/s against panda-gym's; reset: with 1 object and with 8")
+    if not panda_gym_is_installed():
+        print(MISSING)
+
+
+if __name__ == "__main__":
+    main()
