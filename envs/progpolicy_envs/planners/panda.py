@@ -110,7 +110,7 @@ def stack(observation: Observation) -> Action:
     way_x, way_y = view.target[0] - view.object[0], view.target[1] - view.object[1]
     # The hand is 20 cm wide along y and must not meet the tower either.
     near_tower = abs(view.to_target[0]) < 0.1 and abs(view.to_target[1]) < 0.18
-    placed = view.distance < 0.012 and abs(view.object[2] - top) < 0.008
+    placed = view.distance < 0.012 and abs(view.object[2] - top) < 0.004
     if placed and view.reach < 0.04:
         return _leave(view)
     if _holds(view):
@@ -132,8 +132,9 @@ def _holds(view: _View) -> bool:
 
 
 def _leave(view: _View) -> Action:
-    """Open the fingers, then rise."""
-    return _action(0.0, 0.0, _STEP if view.width > 0.06 else 0.0, _OPEN)
+    """Open the fingers, then rise, slowly as long as the object is between them: a jerk would drag it along."""
+    around = view.reach < 0.03 and abs(view.to_object[2]) < 0.03
+    return _action(0.0, 0.0, (0.02 if around else _STEP) if view.width > 0.06 else 0.0, _OPEN)
 
 
 def _approach(view: _View, clear: float) -> Action:
