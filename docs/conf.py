@@ -7,6 +7,7 @@ from importlib.metadata import version as installed_version
 from pathlib import Path
 
 import gymnasium as gym
+import numpy as np
 from gymnasium.envs.registration import load_env_creator
 
 from progpolicy_envs import DOMAINS
@@ -29,6 +30,7 @@ python_use_unqualified_type_names = True
 
 ENVIRONMENTS = Path(__file__).parent / "environments"
 IMAGES = Path(__file__).parent / "images"
+N_PLANNED = 100  # seeds for which the planners' figures are computed
 CONTROLLERS = Path(__file__).parents[1] / "benchmarks" / "results" / "panda_control.md"
 
 
@@ -44,13 +46,31 @@ def environment_page(env_id: str) -> str:
     lines += [inspect.getdoc(creator) or "", "", "## Variations", ""]
     for words, variations in (("Training", domain.train), ("Unseen in training, to test on", domain.unseen)):
         lines += [f"{words}:", "", *(f"* `{variation}`" for variation in variations), ""]
-    return "\n".join(lines + controller_figures(env_id))
+    return "\n".join(lines + (controller_figures(env_id) if domain.simulation else planner_figures(env_id)))
+
+
+def planner_figures(env_id: str) -> list[str]:
+    """Return how many steps the exact planner of a planning domain needs, computed now."""
+    lines = [
+        "## Planner",
+        "",
+        "Steps of the exact planner (`progpolicy_envs.planners`), the fewest there are, over the starts of seeds 0 to "
+        f'{N_PLANNED - 1}; `reset` returns them as `info["optimal_steps"]`:',
+        "",
+        "| Variation | mean | least | most |",
+        "|---|---|---|---|",
+    ]
+    env = gym.make(env_id)
+    for variation in (*DOMAINS[env_id].train, *DOMAINS[env_id].unseen):
+        steps = [env.reset(seed=seed, options=dict(variation))[1]["optimal_steps"] for seed in range(N_PLANNED)]
+        name = ", ".join(f"{key} = {value}" for key, value in variation.items())
+        lines.append(f"| {name} | {np.mean(steps):.1f} | {min(steps)} | {max(steps)} |")
+    env.close()
+    return [*lines, ""]
 
 
 def controller_figures(env_id: str) -> list[str]:
-    """Return how often the scripted controller solves a Panda task, or nothing for the other domains."""
-    if not DOMAINS[env_id].simulation:
-        return []
+    """Return how often the scripted controller solves a Panda task."""
     command, commit, *table = [line for line in CONTROLLERS.read_text(encoding="utf-8").splitlines() if line]
     rows = [line for line in table if line.startswith(("| Task ", "|---", f"| {env_id} "))]
     words = (
