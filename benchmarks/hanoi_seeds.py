@@ -12,52 +12,22 @@ Writes ``benchmarks/results/<name>.csv``, a plot and a ``.json`` with command, c
 from __future__ import annotations
 
 import argparse
-import csv
 import io
-import json
 import multiprocessing
-import platform
-import subprocess
-import sys
 from collections.abc import Iterator
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from rich.progress import track
+from study import RESULTS, train, write_results
 
 from sb3_progpolicy.evaluation import Evaluation, evaluate_program
 from sb3_progpolicy.programs.files import write_atomically
 from sb3_progpolicy.programs.syntax import Program
 
-RESULTS = Path(__file__).parent / "results"
 SIZES, LONG_SIZES = range(1, 9), (9, 10)
 TRAINED_SIZES = range(1, 5)
 COLUMNS = ("seed", "n_discs", "semantics", "steps", "optimal_steps", "success", "n_conditions", "train_seconds")
-
-
-def train(seed: int, folder: Path, overrides: dict[str, Any]) -> Program:
-    """Return the program of one seed, trained now or read from ``folder``."""
-    import time
-
-    import torch as th
-
-    from sb3_progpolicy.training import build_model, make_config
-
-    config = make_config("reptile_ppo", "Hanoi-v0", seed, overrides=overrides, device="cpu")
-    path = folder / f"seed_{seed}.json"
-    settings = json.loads(json.dumps(dict(config.hyperparams)))
-    if path.exists() and (program := Program.load(path)).metadata.get("hyperparams") == settings:
-        return program
-    th.set_num_threads(1)
-    started = time.perf_counter()
-    model, _ = build_model(config)
-    model.learn(config.n_timesteps)
-    seconds = round(time.perf_counter() - started, 1)
-    program = model.program(hyperparams=settings, train_seconds=seconds)  # type: ignore[attr-defined]
-    folder.mkdir(parents=True, exist_ok=True)
-    program.save(path)
-    return program
 
 
 def evaluate(program: Program) -> Iterator[Evaluation]:
@@ -72,7 +42,7 @@ def evaluate(program: Program) -> Iterator[Evaluation]:
 def run_seed(job: tuple[int, Path, dict[str, Any]]) -> list[dict[str, Any]]:
     """Train and evaluate one seed."""
     seed, folder, overrides = job
-    program = train(seed, folder, overrides)
+    program = train("Hanoi-v0", seed, folder, overrides)
     return [
         {
             "seed": seed,
@@ -86,26 +56,6 @@ def run_seed(job: tuple[int, Path, dict[str, Any]]) -> list[dict[str, Any]]:
         }
         for row in evaluate(program)
     ]
-
-
-def write_results(name: str, rows: list[dict[str, Any]], overrides: dict[str, Any]) -> None:
-    """Write table, plot and origin."""
-    RESULTS.mkdir(exist_ok=True)
-    table = io.StringIO()
-    writer = csv.DictWriter(table, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_atomically(RESULTS / f"{name}.csv", table.getvalue())
-    packages = ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy")
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
-    origin = {
-        "command": " ".join(["python", "benchmarks/hanoi_seeds.py", *sys.argv[1:]]),
-        "commit": commit,
-        "overrides": overrides,
-        "versions": {"python": platform.python_version(), **{package: version(package) for package in packages}},
-    }
-    write_atomically(RESULTS / f"{name}.json", json.dumps(origin, indent=2) + "\n")
-    plot(name, rows)
 
 
 def plot(name: str, rows: list[dict[str, Any]]) -> None:
@@ -183,7 +133,8 @@ def main() -> None:
     with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
         done = track(pool.imap(run_seed, jobs), "Seeds", total=len(jobs))
         rows = [row for seed_rows in done for row in seed_rows]
-    write_results(options.name, rows, overrides)
+    write_results(options.name, COLUMNS, rows, overrides)
+    plot(options.name, rows)
     summarise(rows)
 
 
