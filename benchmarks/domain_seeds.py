@@ -72,9 +72,8 @@ def main() -> None:
         here = [row for row in rows if row["variation"] == variation]
         rates = [row["success_rate"] for row in here]
         steps = np.mean([row["steps_mean"] for row in here])
-        print(
-            f"{variation} ({here[0]['set']}): success {np.mean(rates):.1%}, worst seed {min(rates):.0%}, {steps:.1f} steps"
-        )
+        success = f"success {np.mean(rates):.1%}, worst seed {min(rates):.0%}"
+        print(f"{variation} ({here[0]['set']}): {success}, {steps:.1f} steps")
 
 
 if __name__ == "__main__":
