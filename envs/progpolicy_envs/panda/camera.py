@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pybullet
 
 from progpolicy_envs.panda.scene import MAX_OBJECTS, Scene
+from progpolicy_envs.panda.shapes import visual_drum
 from progpolicy_envs.panda.tasks import Reach, Slide, Stack, Task
 from progpolicy_envs.rendering import Frame
 
@@ -91,14 +94,14 @@ class Camera:
 
     def _puck(self, colour: tuple[float, float, float]) -> int:
         radius, _, half_height = Slide.kind.half_extents
-        return self._ghost(pybullet.GEOM_CYLINDER, [*colour, 1.0], radius=radius, length=2 * half_height)
+        return self._drum([*colour, 1.0], radius, 2 * half_height)
 
     def _target(self, colour: tuple[float, float, float]) -> int:
         if isinstance(self.task, Reach):
             return self._ghost(pybullet.GEOM_SPHERE, [*colour, 1.0], radius=0.02)
         if isinstance(self.task, Stack):
             return self._ghost(pybullet.GEOM_BOX, [*colour, 1.0], halfExtents=[0.01, 0.01, 0.01])
-        return self._ghost(pybullet.GEOM_CYLINDER, _pale(colour), radius=self.task.tolerance, length=0.002)
+        return self._drum(_pale(colour), self.task.tolerance, 0.002)
 
     def _target_position(self, index: int) -> tuple[float, float, float]:
         x, y, z = self.task.targets[index]
@@ -107,13 +110,18 @@ class Camera:
             return x + 0.12, y, 0.01 + 0.02 * index
         return (x, y, z) if isinstance(self.task, Reach) else (x, y, 0.001)
 
+    def _drum(self, colour: list[float], radius: float, length: float) -> int:
+        return self._body(visual_drum(radius, length, **self._look(colour)))
+
     def _ghost(self, geometry: int, colour: list[float], **size: float | list[float]) -> int:
-        client = self.scene.client
-        shape = pybullet.createVisualShape(
-            geometry, rgbaColor=colour, specularColor=[0, 0, 0], physicsClientId=client, **size
-        )
+        return self._body(pybullet.createVisualShape(geometry, **self._look(colour), **size))
+
+    def _look(self, colour: list[float]) -> dict[str, Any]:
+        return {"rgbaColor": colour, "specularColor": [0, 0, 0], "physicsClientId": self.scene.client}
+
+    def _body(self, shape: int) -> int:
         body: int = pybullet.createMultiBody(
-            baseMass=0, baseVisualShapeIndex=shape, basePosition=_AWAY, physicsClientId=client
+            baseMass=0, baseVisualShapeIndex=shape, basePosition=_AWAY, physicsClientId=self.scene.client
         )
         return body
 

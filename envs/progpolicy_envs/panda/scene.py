@@ -10,6 +10,7 @@ import pybullet
 import pybullet_data
 
 from progpolicy_envs.panda.robot import PandaRobot
+from progpolicy_envs.panda.shapes import visual_drum
 
 MAX_OBJECTS = 8
 #: Levels of a tower beyond which the solver gets no more iterations.
@@ -166,19 +167,13 @@ class Scene:
         if kind.shape == "box":
             geometry = pybullet.GEOM_BOX
             size: dict[str, Any] = {"halfExtents": kind.half_extents}
-            looks = size
         else:
             geometry = pybullet.GEOM_CYLINDER
             size = {"radius": radius, "height": height}
-            looks = {"radius": radius, "length": height}
         body: int = pybullet.createMultiBody(
             baseMass=kind.mass,
             baseCollisionShapeIndex=pybullet.createCollisionShape(geometry, physicsClientId=client, **size),
-            baseVisualShapeIndex=pybullet.createVisualShape(
-                geometry, specularColor=[0, 0, 0], physicsClientId=client, **looks
-            )
-            if visual
-            else -1,
+            baseVisualShapeIndex=self._look(kind) if visual else -1,
             basePosition=(0, 0, 0),
             physicsClientId=client,
         )
@@ -186,6 +181,12 @@ class Scene:
         if self.physics.sleeping:
             self._activate(body, pybullet.ACTIVATION_STATE_ENABLE_SLEEPING)
         return body
+
+    def _look(self, kind: ObjectKind) -> int:
+        matt = {"specularColor": [0, 0, 0], "physicsClientId": self.client}
+        if kind.shape == "box":
+            return int(pybullet.createVisualShape(pybullet.GEOM_BOX, halfExtents=kind.half_extents, **matt))
+        return visual_drum(kind.half_extents[0], 2 * kind.half_extents[2], **matt)
 
     @property
     def rest_height(self) -> float:
