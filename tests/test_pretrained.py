@@ -6,7 +6,7 @@ import pytest
 
 import sb3_progpolicy.pretrained as pretrained
 from progpolicy_envs.hanoi import MOVES
-from sb3_progpolicy import load_pretrained, pretrained_names
+from sb3_progpolicy import evaluate_program, load_pretrained, pretrained_names
 from sb3_progpolicy.programs import ProgramRunner, join_inputs
 from tests.envs.test_hanoi import Referee
 from tests.handwritten.hanoi import hanoi_program
@@ -53,3 +53,10 @@ def test_moves_of_the_shipped_program_obey_the_puzzles_rules_and_are_the_fewest(
         ended, n_moves = terminated or truncated, n_moves + 1
     assert referee.piles[2] == list(range(n_discs, 0, -1))
     assert n_moves == 2**n_discs - 1
+
+
+@pytest.mark.parametrize(("name", "variation"), [("Hanoi-v0", {"n_discs": 7}), ("PandaReach-v0", {"n_targets": 8})])
+def test_shipped_programs_solve_what_they_were_not_trained_on(name, variation):
+    (result,) = evaluate_program(load_pretrained(name), name, [variation], n_episodes=3, seed=50)
+    assert result.success_rate == 1
+    assert result.optimal_steps_mean in (None, result.steps_mean)
