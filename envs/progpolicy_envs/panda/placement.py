@@ -52,7 +52,8 @@ def distances(candidates: Points, others: Points) -> NDArray[np.float64]:
     """Return the distance of each candidate from the nearest of the others, ``(n,)``; infinite without others."""
     if not len(others):
         return np.full(len(candidates), np.inf)
-    return np.linalg.norm(candidates[:, None] - others[None], axis=-1).min(axis=1)
+    offsets = candidates[:, None] - others[None]
+    return np.sqrt((offsets * offsets).sum(axis=-1)).min(axis=1)
 
 
 def corridor_distances(starts: Points, ends: Points, others: Points) -> NDArray[np.float64]:
@@ -67,7 +68,8 @@ def corridor_distances(starts: Points, ends: Points, others: Points) -> NDArray[
     offsets = others[None] - starts[:, None]
     lengths = np.maximum((ways**2).sum(axis=-1), 1e-12)
     share = np.clip((offsets * ways[:, None]).sum(axis=-1) / lengths[:, None], 0, 1)
-    return np.linalg.norm(offsets - share[..., None] * ways[:, None], axis=-1)
+    aside = offsets - share[..., None] * ways[:, None]
+    return np.sqrt((aside * aside).sum(axis=-1))
 
 
 def extended(starts: Points, targets: Points, back: float) -> Points:

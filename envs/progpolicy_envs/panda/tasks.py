@@ -129,15 +129,18 @@ class Push(Task):
             return points[0], points[1]
 
         def accept(starts: Points, targets: Points, before: Points, done: Points) -> NDArray[np.bool_]:
-            behind = extended(starts, targets, self.run_up)
             length = np.linalg.norm(targets - starts, axis=1)
-            fits = (length > 0.1) & (length < 0.35) & reachable(behind) & reachable(starts) & reachable(targets)
+            fits = (length > 0.1) & (length < 0.35) & reachable(starts) & reachable(targets)
             fits &= (distances(starts, before) > self.separation) & (distances(targets, done) > self.separation)
-            if len(before):
+            # The rest is dear and only asked of those that are left.
+            (left,) = fits.nonzero()
+            behind, starts, targets = extended(starts[left], targets[left], self.run_up), starts[left], targets[left]
+            fits[left] = reachable(behind)
+            if len(before) and len(left):
                 # While this block is pushed the earlier ones lie on their targets, and the other way round.
-                fits &= (corridor_distances(behind, targets, done) > self.clearance).all(axis=1)
+                fits[left] &= (corridor_distances(behind, targets, done) > self.clearance).all(axis=1)
                 ways = corridor_distances(extended(before, done, self.run_up), done, starts)
-                fits &= (ways > self.clearance).all(axis=0)
+                fits[left] &= (ways > self.clearance).all(axis=0)
             return fits
 
         return _on_table(*sample_in_order(n_objects, propose, accept), height=self.kind.height)
