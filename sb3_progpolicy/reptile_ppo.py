@@ -333,7 +333,7 @@ class ReptilePPO(PPO):
         if self._sampler is None:
             return self._act_by_policy(buffer, step)
         features = np.asarray(self._last_obs, dtype=np.float32)
-        if self.normalize_observations:
+        if isinstance(self.policy.features_extractor, NormalizingExtractor):
             features = self.policy.features_extractor(th.from_numpy(features)).numpy()
         return self._sampler.sample(features).reshape(self.n_envs, *self.action_space.shape)  # type: ignore[misc]
 
@@ -350,8 +350,10 @@ class ReptilePPO(PPO):
         return drawn.cpu().numpy()
 
     def _present_states(self) -> RNNStates:
+        """Return the recurrent states after the last step; the sampler keeps its own while it acts."""
         if self._sampler is not None:
-            return RNNStates(self._sampler.state, self._sampler.state)
+            states = self._sampler.state
+            return RNNStates(states, states)
         assert self._last_lstm_states is not None
         return self._last_lstm_states
 

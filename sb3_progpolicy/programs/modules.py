@@ -231,7 +231,11 @@ class ProgramModule(nn.Module):
         return terms.permute(2, 1, 0).contiguous()
 
     def mix_derivation(self, terms: th.Tensor) -> th.Tensor:
-        """Return what :meth:`mix` returns, from :meth:`derivation_terms`, ``(n, n_outputs)``."""
+        """Return what :meth:`mix` returns.
+
+        :param terms: from :meth:`derivation_terms`, ``(n, n_terms, n_in_use)``
+        :return: ``(n, n_outputs)``
+        """
         return self._to_parameters(terms @ self.choices())
 
     def _terms(self, inputs: th.Tensor) -> th.Tensor:
