@@ -6,8 +6,9 @@ Random actions, one environment, one core. A block is a reset, not timed, and 50
 Seconds are of processor time, and in every round each candidate runs its blocks one after the other, so that a busy
 machine slows all of them alike; the table shows medians over the rounds, of the ratios too.
 
-The bare physics are the same blocks once more with nothing but the motor commands and the calls of
-``stepSimulation``, recorded before: the arm and the objects move as with the environment, to the last bit.
+The bare physics are the same blocks once more with nothing but the calls that go into the physics, recorded before:
+nearly all of them ``stepSimulation``, then the motor commands, and now and then a finer time step or a body put to
+sleep. The arm and the objects move as with the environment, to the last bit.
 panda-gym's Stack has two blocks, so there ours has two as well. Its step is 1/25 s, ours 1/30 s.
 """
 
@@ -31,6 +32,9 @@ MISSING = (
     "panda-gym is not installed, so its columns are empty; it is in the extra `peers`: "
     'pip install "sb3-progpolicy[peers]", or panda-gym alone'
 )
+#: What goes into the physics, as opposed to what is read from them.
+PHYSICS_CALLS = ("stepSimulation", "setJointMotorControlArray", "setPhysicsEngineParameter", "changeDynamics")
+Call = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
 #: Runs a block and returns the seconds of its reset and of its steps.
 Block = Callable[[int], tuple[float, float]]
 
@@ -67,35 +71,18 @@ def made(env_id: str, **arguments: Any) -> gym.Env[Any, Any]:
 def physics_runner(env: gym.Env[Any, Any]) -> Block:
     """Return a runner of the same blocks as :func:`block_runner`'s in which only the physics are computed."""
     world, run = env.unwrapped.scene, block_runner(env)  # type: ignore[attr-defined]
-    command = pybullet.setJointMotorControlArray
-    recorded: dict[int, list[tuple[Any, Any]]] = {}
+    calls: dict[int, list[Call]] = {}
     ends: dict[int, Any] = {}
 
-    def record(seed: int) -> None:
-        commands = recorded[seed] = []
-
-        def recording(*args: Any, **kwargs: Any) -> None:
-            commands.append((args, kwargs))
-            command(*args, **kwargs)
-
-        pybullet.setJointMotorControlArray = recording
-        try:
-            run(seed)
-        finally:
-            pybullet.setJointMotorControlArray = command
-        del commands[:-STEPS]  # those of the reset
-        ends[seed] = world.robot.position, world.positions
-
     def replay(seed: int) -> tuple[float, float]:
-        if seed not in recorded:
-            record(seed)
+        if seed not in calls:
+            recorded, in_reset = record(env, seed, run)
+            calls[seed] = recorded[in_reset:]
+            ends[seed] = world.robot.position, world.positions
         env.reset(seed=seed)
-        step, client, substeps = pybullet.stepSimulation, world.client, range(world.physics.substeps)
         start = time.process_time()
-        for args, kwargs in recorded[seed]:
-            command(*args, **kwargs)
-            for _ in substeps:
-                step(client)
+        for function, args, kwargs in calls[seed]:
+            function(*args, **kwargs)
         seconds = time.process_time() - start
         world.read()
         if (world.robot.position, world.positions) != ends[seed]:
@@ -103,6 +90,31 @@ def physics_runner(env: gym.Env[Any, Any]) -> Block:
         return 0.0, seconds
 
     return replay
+
+
+def record(env: gym.Env[Any, Any], seed: int, run: Block) -> tuple[list[Call], int]:
+    """Run a block; return the calls that went into the physics, and how many of them the reset made."""
+    calls: list[Call] = []
+    functions = {name: getattr(pybullet, name) for name in PHYSICS_CALLS}
+
+    def recording(function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> None:
+            calls.append((function, args, kwargs))
+            function(*args, **kwargs)
+
+        return call
+
+    try:
+        for name, function in functions.items():
+            setattr(pybullet, name, recording(function))
+        env.reset(seed=seed)
+        in_reset = len(calls)
+        calls.clear()
+        run(seed)
+    finally:
+        for name, function in functions.items():
+            setattr(pybullet, name, function)
+    return calls, in_reset
 
 
 def panda_gym_is_installed() -> bool:

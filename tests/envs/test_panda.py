@@ -15,7 +15,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 import progpolicy_envs
 from progpolicy_envs.panda.robot import arm_angles
-from progpolicy_envs.panda.scene import Physics, Scene
+from progpolicy_envs.panda.scene import CONTROL_STEP, Physics, Scene
 from progpolicy_envs.panda.tasks import Push, Slide, Stack
 from progpolicy_envs.planners.panda import CONTROLLERS
 
@@ -277,6 +277,50 @@ def test_stack_of_eight_stands_for_ten_seconds_awake_or_not():
         begin = settle(scene, 0.2)
         assert np.abs(settle(scene, 10) - begin).max() < 0.01
         scene.close()
+
+
+def substeps(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> int:
+    """Return how many physics steps the next control step takes."""
+    calls = []
+    step = pybullet.stepSimulation
+    with monkeypatch.context() as patch:
+        patch.setattr(pybullet, "stepSimulation", lambda client: (calls.append(client), step(client)))
+        scene.step()
+    return len(calls)
+
+
+def test_physics_are_finer_while_something_is_off_the_table_or_between_the_fingers(monkeypatch):
+    scene = Scene(Push.table, Push.kind)
+    coarse, fine = Physics().substeps, Physics().delicate_substeps
+    gripper = scene.robot.position
+    parameters = {
+        "on the table": ([(-0.1, 0.2, 0.02)], coarse, 10),
+        "in the air": ([(-0.1, 0.2, 0.12)], fine, 60),
+        "between the fingers": ([(gripper[0] + 0.01, gripper[1], gripper[2])], fine, 60),
+    }
+    for positions, steps, iterations in parameters.values():
+        scene.place(positions)
+        engine = pybullet.getPhysicsEngineParameters(scene.client)
+        assert engine["numSolverIterations"] == iterations
+        assert substeps(scene, monkeypatch) * engine["fixedTimeStep"] == pytest.approx(CONTROL_STEP)
+        assert steps * engine["fixedTimeStep"] == pytest.approx(CONTROL_STEP)
+    scene.close()
+
+
+def test_a_block_at_rest_falls_asleep_and_falls_when_what_bears_it_is_taken_away():
+    scene = Scene(Stack.table, Stack.kind)
+    scene.place([(-0.1, 0.2, 0.02), (-0.1, 0.2, 0.06)])
+    settle(scene, 1)
+    asleep = scene.positions[1]
+    settle(scene, 0.2)
+    assert scene.positions[1] == asleep, "a sleeping block does not move by a single bit"
+    pybullet.changeDynamics(
+        scene.objects[0], -1, activationState=pybullet.ACTIVATION_STATE_WAKE_UP, physicsClientId=scene.client
+    )
+    scene.step()
+    pybullet.resetBaseVelocity(scene.objects[0], (3, 0, 0), physicsClientId=scene.client)
+    assert settle(scene, 1)[1, 2] == pytest.approx(0.02, abs=2e-3)
+    scene.close()
 
 
 def test_pushed_block_does_not_tunnel_through_another():

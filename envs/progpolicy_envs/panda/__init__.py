@@ -105,7 +105,7 @@ class PandaReachEnv(PandaEnv):
     | n_targets   | 1 to 8              | 1         | number of targets                                         |
     | observation | "flat", "goal"      | "flat"    | one array, or the dictionary of a goal environment        |
     | reward_type | "dense", "sparse"   | "dense"   | see above                                                 |
-    | physics     | ``Physics``, None   | None      | time step and solver; None is 240 Hz, 8 steps an action   |
+    | physics     | ``Physics``, None   | None      | time step and solver; None is 120 Hz, 4 steps an action   |
 
     ## References
     panda-gym (Gallouédec, Cazin, Dellandréa and Chen, 2021), whose robot, table and control these are.
@@ -222,7 +222,7 @@ class PandaPushEnv(PandaEnv):
     | n_objects   | 1 to 8              | 1         | number of blocks                                          |
     | observation | "flat", "goal"      | "flat"    | one array, or the dictionary of a goal environment        |
     | reward_type | "dense", "sparse"   | "dense"   | see above                                                 |
-    | physics     | ``Physics``, None   | None      | time step and solver; None is 240 Hz, 8 steps an action   |
+    | physics     | ``Physics``, None   | None      | time step and solver; None is 120 Hz, 4 steps an action   |
 
     ## References
     panda-gym (Gallouédec, Cazin, Dellandréa and Chen, 2021), whose robot, table and control these are.
@@ -343,7 +343,7 @@ class PandaSlideEnv(PandaEnv):
     | n_objects   | 1 to 8              | 1         | number of pucks                                           |
     | observation | "flat", "goal"      | "flat"    | one array, or the dictionary of a goal environment        |
     | reward_type | "dense", "sparse"   | "dense"   | see above                                                 |
-    | physics     | ``Physics``, None   | None      | time step and solver; None is 240 Hz, 8 steps an action   |
+    | physics     | ``Physics``, None   | None      | time step and solver; None is 120 Hz, 4 steps an action   |
 
     ## References
     panda-gym (Gallouédec, Cazin, Dellandréa and Chen, 2021), whose robot, table and control these are.
@@ -461,7 +461,7 @@ class PandaStackEnv(PandaEnv):
     | n_objects   | 1 to 8              | 1         | number of blocks                                          |
     | observation | "flat", "goal"      | "flat"    | one array, or the dictionary of a goal environment        |
     | reward_type | "dense", "sparse"   | "dense"   | see above                                                 |
-    | physics     | ``Physics``, None   | None      | time step and solver; None is 240 Hz, 8 steps an action   |
+    | physics     | ``Physics``, None   | None      | time step and solver; None is 120 Hz, 4 steps an action   |
 
     ## References
     panda-gym (Gallouédec, Cazin, Dellandréa and Chen, 2021), whose robot, table and control these are.

@@ -95,6 +95,7 @@ class PandaEnv(gym.Env[Any, NDArray[np.float32]]):
         self.scene = Scene(self.task.table, self.task.kind, physics, visual=render_mode is not None)
         self._camera = Camera(self.scene, self.task) if render_mode is not None else None
         self._display = Display(self.metadata["render_fps"])
+        self._reach = 0.0
 
     @property
     def size(self) -> int:
@@ -135,15 +136,17 @@ class PandaEnv(gym.Env[Any, NDArray[np.float32]]):
         self.scene.robot.act(numbers)
         self.scene.step()
         task.update(self.scene)
-        shaping = STEP + APPROACH * (reach - self._handle_distance(index)) + FAILURE * task.failed
-        self._look()
+        failure = task.failed
+        self._reach = self._handle_distance(index)
+        shaping = STEP + APPROACH * (reach - self._reach) + FAILURE * failure
+        self._look(index)
         shaping += FINISHED * (n_left - self._n_left)
         if self._focus != index:
             # The new object has made no progress yet; that of the old one goes into the shaping.
             target = task.targets[index]
             shaping += PROGRESS * (math.dist(achieved, target) - math.dist(task.positions[index], target))
             achieved = self._achieved
-        success, failure = self._n_left == 0, task.failed
+        success = self._n_left == 0
         info = {
             "is_success": success,
             "is_failure": failure,
@@ -177,13 +180,17 @@ class PandaEnv(gym.Env[Any, NDArray[np.float32]]):
             return 0.0 if distance < self.task.tolerance and info["settled"] else -1.0
         return PROGRESS * (math.dist(info["previous_achieved_goal"], self._desired) - distance) + info["shaping"]
 
-    def _look(self) -> None:
-        """Turn to the object in focus and remember its state, from which progress is measured."""
+    def _look(self, before: int | None = None) -> None:
+        """Turn to the object in focus and remember its state, from which progress is measured.
+
+        :param before: the object in focus before, to which the gripper's distance is known
+        """
         self._focus = self.task.focus
         self._n_left = self.task.finished.count(False)
         self._achieved = self.task.positions[self._focus]
         self._desired = self.task.targets[self._focus]
-        self._reach = self._handle_distance(self._focus)
+        if self._focus != before:
+            self._reach = self._handle_distance(self._focus)
 
     def _handle_distance(self, index: int) -> float:
         handle = self.task.handle(index)
@@ -193,8 +200,7 @@ class PandaEnv(gym.Env[Any, NDArray[np.float32]]):
         """Return the object in focus; in Reach the gripper itself, in Slide a delivered puck where it was delivered."""
         if self.task.kind is None:
             return ObjectState(self._achieved, _UPRIGHT, self.scene.robot.velocity, _STILL)
-        state = self.scene.object_state(self._focus)
-        return ObjectState(self._achieved, state.orientation, state.velocity, state.spin)
+        return self.scene.object_state(self._focus, self._achieved)
 
     def _observe(self) -> Observation:
         observation = focus_observation(self.scene.robot, self._focus_state(), self._desired, self._n_left)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from operator import le
 
 import pybullet
 
@@ -67,7 +68,9 @@ def arm_angles(x: float, y: float, z: float) -> list[float]:
     at_shoulder = _corner(_TO_ELBOW, span, _TO_WRIST)
     shoulder = math.atan2(out, up) - at_shoulder - _ELBOW_ANGLES[0]
     elbow = at_elbow - math.pi - sum(_ELBOW_ANGLES)
-    angles = (turn, shoulder, 0.0, elbow, 0.0, shoulder - elbow, turn + math.pi / 4)
+    angles = [turn, shoulder, 0.0, elbow, 0.0, shoulder - elbow, turn + math.pi / 4]
+    if all(map(le, _LOWER, angles)) and all(map(le, angles, _UPPER)):
+        return angles
     return [min(high, max(low, angle)) for angle, low, high in zip(angles, _LOWER, _UPPER, strict=True)]
 
 
@@ -81,11 +84,10 @@ class PandaRobot:
     """The arm in one PyBullet world, its gripper always pointing down, its fingers opening along y.
 
     :param client: the physics client
-    :param time_step: physics time step, seconds
     :param visual: whether to load the meshes needed for pictures
     """
 
-    def __init__(self, client: int, time_step: float, visual: bool = False) -> None:
+    def __init__(self, client: int, visual: bool = False) -> None:
         self.client = client
         flags = 0 if visual else pybullet.URDF_IGNORE_VISUAL_SHAPES
         self.body = pybullet.loadURDF(
@@ -96,11 +98,18 @@ class PandaRobot:
                 self.body, finger, lateralFriction=1.0, spinningFriction=0.001, physicsClientId=client
             )
         self._couple_fingers()
-        self._gains = [motor_gain(time_step)] * len(_JOINTS)
+        self.set_time_step(1 / 240)
         self.position = self.velocity = (0.0, 0.0, 0.0)
         self.width = 0.0
         self.place()
         self.read()
+
+    def set_time_step(self, time_step: float) -> None:
+        """Adapt the motors to the physics time step; the next action uses them.
+
+        :param time_step: seconds
+        """
+        self._gains = [motor_gain(time_step)] * len(_JOINTS)
 
     def _couple_fingers(self) -> None:
         """Make the fingers move symmetrically, as those of the real hand do; PyBullet leaves out the URDF's mimic."""
@@ -122,11 +131,11 @@ class PandaRobot:
 
     def read(self) -> None:
         """Take over the state of the simulation; two calls of PyBullet in all."""
-        (left, *_), (right, *_) = pybullet.getJointStates(self.body, _FINGERS, self.client)
+        left, right = pybullet.getJointStates(self.body, _FINGERS, self.client)
         link = pybullet.getLinkState(self.body, _GRIPPER, True, False, self.client)
         self.position = link[0]
         self.velocity = link[6]
-        self.width = left + right
+        self.width = left[0] + right[0]
 
     def act(self, action: Sequence[float]) -> None:
         """Set the motors for one action.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -13,11 +14,15 @@ from progpolicy_envs.panda.robot import PandaRobot
 from progpolicy_envs.panda.shapes import visual_drum
 
 MAX_OBJECTS = 8
-#: Levels of a tower beyond which the solver gets no more iterations.
-MAX_LEVELS = 6
 #: Seconds of one control step.
 CONTROL_STEP = 1 / 30
 TABLE_HEIGHT = 0.4
+#: An object whose centre is this near to the point between the fingertips may be held, metres.
+HOLD_DISTANCE = 0.03
+#: An object whose centre is this far above where it lies on the table has been lifted, metres.
+LIFT_HEIGHT = 0.005
+#: An object that moves less than this in one control step is still, metres; so many such steps and it sleeps.
+STILL_MOTION, STILL_STEPS = 1e-5, 3
 #: An object whose centre is this far below the table's top has left the table, metres.
 FALL_DEPTH = 0.05
 
@@ -31,21 +36,36 @@ _STILL = (0.0, 0.0, 0.0)
 class Physics:
     """How finely the world is simulated.
 
+    What lies on the table is pushed about well enough by coarse steps with few iterations of the contact solver. With
+    these a block slips out of the fingers when it is lifted, and a tower trembles until it falls; so while an object is
+    between the fingers or off the table the steps are finer and the iterations more, and the world is called delicate.
+
     :param frequency: physics steps per second
-    :param substeps: physics steps in one control step
-    :param solver_iterations: iterations of the contact solver in each physics step, for each level of a tower: ten
-        are enough for blocks on the table, but a tower of eight needs about fifty to stand
-    :param sleeping: whether bodies at rest are left out of the simulation until something touches them
+    :param substeps: physics steps in one control step, which therefore takes ``substeps / frequency`` seconds
+    :param solver_iterations: iterations of the contact solver in each physics step
+    :param delicate_substeps: physics steps in one control step while the world is delicate
+    :param delicate_iterations: iterations of the contact solver while the world is delicate
+    :param sleeping: whether bodies at rest are left out of the simulation until something touches them; an object
+        falls asleep after a tenth of a second of rest, for which Bullet itself would wait two seconds
     """
 
-    frequency: int = 240
-    substeps: int = 8
+    frequency: int = 120
+    substeps: int = 4
     solver_iterations: int = 10
+    delicate_substeps: int = 8
+    delicate_iterations: int = 60
     sleeping: bool = True
+
+    @property
+    def control_step(self) -> float:
+        """Seconds of one control step."""
+        return self.substeps / self.frequency
 
 
 #: panda-gym's settings, to compare with; its control step is 1/25 s.
-PANDA_GYM_PHYSICS = Physics(frequency=500, substeps=20, solver_iterations=50, sleeping=False)
+PANDA_GYM_PHYSICS = Physics(
+    frequency=500, substeps=20, solver_iterations=50, delicate_substeps=20, delicate_iterations=50, sleeping=False
+)
 
 
 @dataclass(frozen=True)
@@ -117,9 +137,11 @@ class Scene:
         self.kind = kind
         self.physics = physics or Physics()
         self.n_objects = 0
+        self._lifted = self.rest_height + LIFT_HEIGHT
         self.client = pybullet.connect(pybullet.DIRECT)
         self._build(visual)
-        self._levels = 1
+        self._set_delicate(False)
+        self._still_steps = [0] * MAX_OBJECTS
         #: Centres of the objects in use.
         self.positions: list[Point] = []
         self.place([])
@@ -130,13 +152,8 @@ class Scene:
         pybullet.resetSimulation(pybullet.RESET_USE_SIMPLE_BROADPHASE, physicsClientId=client)
         pybullet.setAdditionalSearchPath(pybullet_data.getDataPath(), physicsClientId=client)
         pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
-        pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=1 / self.physics.frequency,
-            numSolverIterations=self.physics.solver_iterations,
-            deterministicOverlappingPairs=1,
-            physicsClientId=client,
-        )
-        self.robot = PandaRobot(client, 1 / self.physics.frequency, visual)
+        pybullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
+        self.robot = PandaRobot(client, visual)
         self._build_table(visual)
         self.objects = [self._build_object(visual) for _ in range(MAX_OBJECTS if self.kind else 0)]
 
@@ -153,6 +170,7 @@ class Scene:
             if visual
             else -1,
             basePosition=[(table.low_x + table.high_x) / 2, 0, -TABLE_HEIGHT / 2],
+            useMaximalCoordinates=True,
             physicsClientId=client,
         )
         if self.physics.sleeping:
@@ -200,6 +218,7 @@ class Scene:
 
         :param positions: the centres of the objects, metres, no two overlapping
         """
+        self._set_delicate(False)
         for index, body in enumerate(self.objects):
             self._move(body, _parking(index))
         self.robot.place()
@@ -211,6 +230,7 @@ class Scene:
             pybullet.stepSimulation(physicsClientId=self.client)
         self.robot.place()
         self.n_objects = len(positions)
+        self._still_steps = [0] * MAX_OBJECTS
         for index, body in enumerate(self.objects):
             used = index < self.n_objects
             self._move(body, positions[index] if used else _parking(index))
@@ -227,36 +247,64 @@ class Scene:
 
     def step(self) -> None:
         """Simulate one control step."""
-        self._set_iterations()
         step, client = pybullet.stepSimulation, self.client
-        for _ in range(self.physics.substeps):
+        for _ in self._substeps:
             step(client)
+        before = self.positions
         self.read()
+        if self.physics.sleeping and before:
+            self._lull(before)
 
-    def _set_iterations(self) -> None:
-        if self.kind is None or not self.positions:
-            return
-        highest = max([position[2] for position in self.positions])
-        levels = min(MAX_LEVELS, max(1, round(highest / (2 * self.kind.height) + 0.5)))
-        if levels != self._levels:
-            self._levels = levels
-            pybullet.setPhysicsEngineParameter(
-                numSolverIterations=(6 if levels > 1 else 1) * self.physics.solver_iterations,
-                physicsClientId=self.client,
-            )
+    def _is_delicate(self) -> bool:
+        gripper, lifted = self.robot.position, self._lifted
+        for position in self.positions:  # noqa: SIM110 - a generator costs more in what every step does
+            if position[2] > lifted or math.dist(position, gripper) < HOLD_DISTANCE:
+                return True
+        return False
+
+    def _set_delicate(self, delicate: bool) -> None:
+        physics = self.physics
+        self._delicate = delicate
+        self._substeps = range(physics.delicate_substeps if delicate else physics.substeps)
+        time_step = physics.control_step / len(self._substeps)
+        self.robot.set_time_step(time_step)
+        pybullet.setPhysicsEngineParameter(
+            fixedTimeStep=time_step,
+            numSolverIterations=physics.delicate_iterations if delicate else physics.solver_iterations,
+            physicsClientId=self.client,
+        )
+
+    def _lull(self, before: Sequence[Point]) -> None:
+        """Put the objects to sleep that have not moved for a while; whatever touches one wakes it.
+
+        :param before: the objects' centres one control step ago
+        """
+        for index, (old, new) in enumerate(zip(before, self.positions, strict=True)):
+            if math.dist(old, new) > STILL_MOTION:
+                self._still_steps[index] = 0
+            else:
+                self._still_steps[index] += 1
+                if self._still_steps[index] == STILL_STEPS:
+                    self._activate(self.objects[index], pybullet.ACTIVATION_STATE_SLEEP)
 
     def read(self) -> None:
-        """Take over the state of the robot and the positions of all objects in use."""
+        """Take over the state of the robot and the positions of all objects in use; simulate as finely as they need."""
         self.robot.read()
         read, client = pybullet.getBasePositionAndOrientation, self.client
         self._poses = [read(body, client) for body in self.objects[: self.n_objects]]
         self.positions = [pose[0] for pose in self._poses]
+        delicate = self._is_delicate()
+        if delicate != self._delicate:
+            self._set_delicate(delicate)
 
-    def object_state(self, index: int) -> ObjectState:
-        """Return the full state of one object."""
+    def object_state(self, index: int, position: Point | None = None) -> ObjectState:
+        """Return the full state of one object.
+
+        :param index: which object
+        :param position: given out as its centre; by default where it is
+        """
         velocity, spin = pybullet.getBaseVelocity(self.objects[index], self.client)
-        position, orientation = self._poses[index]
-        return ObjectState(position, orientation, velocity, spin)
+        return ObjectState(position or self.positions[index], self._poses[index][1], velocity, spin)
 
     def close(self) -> None:
         """Disconnect from PyBullet; a second call does nothing."""

@@ -63,7 +63,7 @@ class Task(ABC):
     @property
     def failed(self) -> bool:
         """Whether an object has left the table."""
-        return any(position[2] < -FALL_DEPTH for position in self.positions)
+        return min([position[2] for position in self.positions]) < -FALL_DEPTH
 
     def settled(self, scene: Scene, index: int) -> bool:
         """Return whether an object, if it is at its target, is finished as far as all else is concerned."""
