@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from progpolicy_envs.panda.placement import (
+    Place,
     Points,
-    corridor_distances,
-    distances,
+    apart,
+    corridor_distance,
     extended,
     reachable,
     sample_in_order,
@@ -91,16 +92,16 @@ class Reach(Task):
 
     def sample(self, rng: np.random.Generator, n_objects: int) -> tuple[Points, Points]:
         """Return no starts and targets in the air, apart from each other and from the gripper's start."""
-        gripper = np.array([[0.04, 0.0, 0.2]])
+        gripper = (0.04, 0.0, 0.2)
 
         def propose(number: int) -> tuple[Points, Points]:
             targets = rng.uniform((-0.2, -0.25, 0.05), (0.13, 0.25, 0.35), (number, 3))
             return targets, targets
 
-        def accept(starts: Points, targets: Points, _: Points, before: Points) -> NDArray[np.bool_]:
-            return distances(targets, np.concatenate((gripper, before))) > self.separation
+        def fits(_: Place, target: Place, before: Sequence[Place], __: Sequence[Place]) -> bool:
+            return apart(target, [gripper, *before], self.separation)
 
-        return np.zeros((0, 3)), sample_in_order(n_objects, propose, accept)[1]
+        return np.zeros((0, 3)), sample_in_order(n_objects, propose, fits)[1]
 
     def handle(self, index: int) -> Point | None:
         """Return ``None``: the gripper itself is what moves."""
@@ -128,22 +129,20 @@ class Push(Task):
             points = rng.uniform((-0.3, -0.27), (0.1, 0.27), (2, number, 2))
             return points[0], points[1]
 
-        def accept(starts: Points, targets: Points, before: Points, done: Points) -> NDArray[np.bool_]:
-            length = np.linalg.norm(targets - starts, axis=1)
-            fits = (length > 0.1) & (length < 0.35) & reachable(starts) & reachable(targets)
-            fits &= (distances(starts, before) > self.separation) & (distances(targets, done) > self.separation)
-            # The rest is dear and only asked of those that are left.
-            (left,) = fits.nonzero()
-            behind, starts, targets = extended(starts[left], targets[left], self.run_up), starts[left], targets[left]
-            fits[left] = reachable(behind)
-            if len(before) and len(left):
-                # While this block is pushed the earlier ones lie on their targets, and the other way round.
-                fits[left] &= (corridor_distances(behind, targets, done) > self.clearance).all(axis=1)
-                ways = corridor_distances(extended(before, done, self.run_up), done, starts)
-                fits[left] &= (ways > self.clearance).all(axis=0)
-            return fits
+        def fits(start: Place, target: Place, before: Sequence[Place], done: Sequence[Place]) -> bool:
+            if not (0.1 < math.dist(start, target) < 0.35 and reachable(start) and reachable(target)):
+                return False
+            if not (apart(start, before, self.separation) and apart(target, done, self.separation)):
+                return False
+            behind = extended(start, target, self.run_up)
+            # While this block is pushed the earlier ones lie on their targets, and the other way round.
+            return reachable(behind) and all(
+                corridor_distance(behind, target, there) > self.clearance
+                and corridor_distance(extended(here, there, self.run_up), there, start) > self.clearance
+                for here, there in zip(before, done, strict=True)
+            )
 
-        return _on_table(*sample_in_order(n_objects, propose, accept), height=self.kind.height)
+        return _on_table(*sample_in_order(n_objects, propose, fits), height=self.kind.height)
 
     def handle(self, index: int) -> Point:
         """Return the point behind the block on the line to its target."""
@@ -158,7 +157,7 @@ class Slide(Task):
     clearance = 0.08
     run_up = 0.06
     #: Half axes of the ellipse around a puck in which no other starts; longer along x, the way to the targets.
-    separation = np.array([0.14, 0.1])
+    separation = (0.14, 0.1)
     #: Tangent of the largest angle between the x axis and the way to the target.
     slope = 0.4
 
@@ -169,31 +168,41 @@ class Slide(Task):
             starts = rng.uniform((-0.28, -0.28), (0.02, 0.28), (number, 2))
             return starts, starts
 
-        def accept(starts: Points, _: Points, before: Points, __: Points) -> NDArray[np.bool_]:
-            return reachable(starts, 0.34, 0.64) & (distances(starts / self.separation, before / self.separation) > 1)
+        def fits(start: Place, _: Place, before: Sequence[Place], __: Sequence[Place]) -> bool:
+            wide, deep = self.separation
+            return reachable(start, 0.34, 0.64) and all(
+                math.hypot((start[0] - x) / wide, (start[1] - y) / deep) > 1 for x, y in before
+            )
 
         while True:
-            starts = sample_in_order(n_objects, propose, accept)[0]
+            starts = sample_in_order(n_objects, propose, fits)[0]
             # The front pucks come first, so that they do not bar the way of those behind them.
             starts = starts[np.argsort(-starts[:, 0])]
-            targets = self._sample_targets(rng, starts)
+            targets = self._sample_targets(rng, starts.tolist())
             if len(targets) == n_objects:
-                return _on_table(starts, targets, height=self.kind.height)
+                return _on_table(starts, np.array(targets), height=self.kind.height)
 
-    def _sample_targets(self, rng: np.random.Generator, starts: Points) -> Points:
-        """Return targets ``(m, 2)`` for the first m pucks; fewer than there are pucks where one finds no place."""
-        targets = np.zeros((0, 2))
+    def _sample_targets(self, rng: np.random.Generator, starts: Sequence[Place]) -> list[Place]:
+        """Return targets for the first pucks, x and y; fewer than there are pucks where one finds no place."""
+        targets: list[Place] = []
         for index, start in enumerate(starts):
-            candidates = rng.uniform((0.3, -0.29), (0.54, 0.29), (128, 2))
-            ways = candidates - start
-            run_up = extended(start, candidates, self.run_up)
-            fits = np.abs(ways[:, 1]) < self.slope * ways[:, 0]
-            fits &= distances(candidates, targets) > 2 * self.tolerance
-            fits &= (corridor_distances(run_up, candidates, starts[index + 1 :]) > self.clearance).all(axis=1)
-            if not fits.any():
+            candidates: list[Place] = rng.uniform((0.3, -0.29), (0.54, 0.29), (128, 2)).tolist()
+            found = next(
+                (place for place in candidates if self._fits(start, place, starts[index + 1 :], targets)), None
+            )
+            if found is None:
                 break
-            targets = np.concatenate((targets, candidates[fits][:1]))
+            targets.append(found)
         return targets
+
+    def _fits(self, start: Place, target: Place, later: Sequence[Place], targets: Sequence[Place]) -> bool:
+        """Return whether a target lies ahead of its puck, apart from the others, no later puck in the way."""
+        if not abs(target[1] - start[1]) < self.slope * (target[0] - start[0]):
+            return False
+        run_up = extended(start, target, self.run_up)
+        return apart(target, targets, 2 * self.tolerance) and all(
+            corridor_distance(run_up, target, other) > self.clearance for other in later
+        )
 
     def update(self, scene: Scene) -> None:
         """Take over the state of the world and take delivered pucks off the table."""
@@ -238,14 +247,17 @@ class Stack(Task):
             starts = rng.uniform((-0.32, -0.28), (0.08, 0.28), (number, 2))
             return starts, np.broadcast_to(foot, starts.shape)
 
-        def accept(starts: Points, targets: Points, before: Points, _: Points) -> NDArray[np.bool_]:
-            x, y = (starts - targets).T
+        def fits(start: Place, target: Place, before: Sequence[Place], _: Sequence[Place]) -> bool:
+            x, y = start[0] - target[0], start[1] - target[1]
             # The wrist behind the gripper must not meet the tower, nor the hand, which is 20 cm wide.
-            fits = ((x < -0.1) | (np.abs(y) > 0.2)) & reachable(starts)
-            apart = np.abs(starts[:, None] - before[None])
-            return fits & ((apart[..., 0] > 0.07) | (apart[..., 1] > 0.11)).all(axis=1)
+            beside = x < -0.1 or abs(y) > 0.2
+            return (
+                beside
+                and reachable(start)
+                and all(abs(start[0] - other[0]) > 0.07 or abs(start[1] - other[1]) > 0.11 for other in before)
+            )
 
-        starts, targets = _on_table(*sample_in_order(n_objects, propose, accept), height=self.kind.height)
+        starts, targets = _on_table(*sample_in_order(n_objects, propose, fits), height=self.kind.height)
         targets[:, 2] += 2 * self.kind.height * np.arange(n_objects)
         return starts, targets
 
