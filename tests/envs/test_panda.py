@@ -285,8 +285,10 @@ def substeps(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> int:
     step = pybullet.stepSimulation
     with monkeypatch.context() as patch:
         patch.setattr(pybullet, "stepSimulation", lambda client: (calls.append(client), step(client)))
+        engine = pybullet.getPhysicsEngineParameters(scene.client)
         scene.step()
-    return len(calls)
+    assert len(calls) * engine["fixedTimeStep"] == pytest.approx(CONTROL_STEP)
+    return len(calls) * engine["numSubSteps"]
 
 
 def test_physics_are_finer_while_something_is_off_the_table_or_between_the_fingers(monkeypatch):
@@ -302,9 +304,27 @@ def test_physics_are_finer_while_something_is_off_the_table_or_between_the_finge
         scene.place(positions)
         engine = pybullet.getPhysicsEngineParameters(scene.client)
         assert engine["numSolverIterations"] == iterations
-        assert substeps(scene, monkeypatch) * engine["fixedTimeStep"] == pytest.approx(CONTROL_STEP)
-        assert steps * engine["fixedTimeStep"] == pytest.approx(CONTROL_STEP)
+        assert substeps(scene, monkeypatch) == steps
     scene.close()
+
+
+@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("physics", [Physics(), Physics(frequency=180, substeps=6, delicate_substeps=12)])
+def test_physics_steps_made_in_one_call_are_those_made_in_many(env_id, physics, monkeypatch):
+    def trajectory():
+        env = make(env_id, 3, physics=physics)
+        controller = CONTROLLERS[env_id]
+        observation, _ = env.reset(seed=1)
+        observations = [observation]
+        for _ in range(60):
+            observations.append(env.step(controller(observations[-1]))[0])
+        env.close()
+        return np.array(observations)
+
+    few = trajectory()
+    in_order = Scene._set_steps
+    monkeypatch.setattr(Scene, "_set_steps", lambda scene, calls, each: in_order(scene, calls * each, 1))
+    assert np.array_equal(few, trajectory())
 
 
 def test_a_block_at_rest_falls_asleep_and_falls_when_what_bears_it_is_taken_away():

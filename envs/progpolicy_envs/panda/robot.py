@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from operator import le
 
 import pybullet
 
@@ -33,6 +32,7 @@ _GAIN_AT_240_HZ = 0.1
 _SHOULDER, _UPPER_ARM, _FOREARM, _ELBOW, _WRIST, _HAND = 0.333, 0.316, 0.384, 0.0825, 0.088, 0.212
 _TO_ELBOW, _TO_WRIST = math.hypot(_UPPER_ARM, _ELBOW), math.hypot(_FOREARM, _ELBOW)
 _ELBOW_ANGLES = math.atan2(_ELBOW, _UPPER_ARM), math.atan2(_ELBOW, _FOREARM)
+_BENT = sum(_ELBOW_ANGLES)
 # The gripper keeps this far from the axis on which the arm turns, where small ways would be large turns.
 _NEAREST = 0.2
 
@@ -67,17 +67,25 @@ def arm_angles(x: float, y: float, z: float) -> list[float]:
     at_elbow = _corner(_TO_ELBOW, _TO_WRIST, span)
     at_shoulder = _corner(_TO_ELBOW, span, _TO_WRIST)
     shoulder = math.atan2(out, up) - at_shoulder - _ELBOW_ANGLES[0]
-    elbow = at_elbow - math.pi - sum(_ELBOW_ANGLES)
-    angles = [turn, shoulder, 0.0, elbow, 0.0, shoulder - elbow, turn + math.pi / 4]
-    if all(map(le, _LOWER, angles)) and all(map(le, angles, _UPPER)):
+    elbow = at_elbow - math.pi - _BENT
+    wrist, hand = shoulder - elbow, turn + math.pi / 4
+    angles = [turn, shoulder, 0.0, elbow, 0.0, wrist, hand]
+    low, high = _LOWER, _UPPER
+    if (
+        low[0] <= turn <= high[0]
+        and low[1] <= shoulder <= high[1]
+        and low[3] <= elbow <= high[3]
+        and low[5] <= wrist <= high[5]
+        and low[6] <= hand <= high[6]
+    ):
         return angles
-    return [min(high, max(low, angle)) for angle, low, high in zip(angles, _LOWER, _UPPER, strict=True)]
+    return [min(most, max(least, angle)) for angle, least, most in zip(angles, low, high, strict=True)]
 
 
 def _corner(one: float, other: float, opposite: float) -> float:
     """Return the angle between two sides of a triangle, 0 or pi where the third is too short or too long for one."""
     cosine = (one * one + other * other - opposite * opposite) / (2 * one * other)
-    return math.acos(min(1.0, max(-1.0, cosine)))
+    return math.acos(cosine) if -1.0 < cosine < 1.0 else math.pi * (cosine < 0.0)
 
 
 class PandaRobot:
@@ -104,12 +112,15 @@ class PandaRobot:
         self.place()
         self.read()
 
-    def set_time_step(self, time_step: float) -> None:
+    def set_time_step(self, time_step: float, in_one_call: int = 1) -> None:
         """Adapt the motors to the physics time step; the next action uses them.
 
         :param time_step: seconds
+        :param in_one_call: how many such steps one call of the simulation makes
         """
         self._gains = [motor_gain(time_step)] * len(_JOINTS)
+        # PyBullet turns a force into the impulse of a whole call and lets the motor exert that in each of its steps.
+        self._forces = [force / in_one_call for force in _FORCES]
 
     def _couple_fingers(self) -> None:
         """Make the fingers move symmetrically, as those of the real hand do; PyBullet leaves out the URDF's mimic."""
@@ -143,7 +154,9 @@ class PandaRobot:
         :param action: four numbers, clipped to [-1, 1]: displacement along x, y, z in units of 5 cm and change of the
             finger width in units of 20 cm, that is: open or close
         """
-        x, y, z, fingers = [min(1.0, max(-1.0, number)) for number in action]
+        if max(action) > 1.0 or min(action) < -1.0:
+            action = [min(1.0, max(-1.0, number)) for number in action]
+        x, y, z, fingers = action
         px, py, pz = self.position
         # As in panda-gym the fingertips are not sent below the table.
         height = max(0.0, pz + z * MAX_DISPLACEMENT)
@@ -157,7 +170,7 @@ class PandaRobot:
             _JOINTS,
             pybullet.POSITION_CONTROL,
             targetPositions=angles,
-            forces=_FORCES,
+            forces=self._forces,
             positionGains=self._gains,
             physicsClientId=self.client,
         )

@@ -54,12 +54,12 @@ class Task(ABC):
     def update(self, scene: Scene) -> None:
         """Take over the state of the world after a control step."""
         self.positions = self._positions(scene)
-        self.finished = [self._is_finished(scene, index) for index in range(len(self.targets))]
+        self.finished = self._finished(scene)
 
     @property
     def focus(self) -> int:
         """Index of the first unfinished object in colour order; the last one when all are finished."""
-        return self.finished.index(False) if not all(self.finished) else len(self.finished) - 1
+        return self.finished.index(False) if False in self.finished else len(self.finished) - 1
 
     @property
     def failed(self) -> bool:
@@ -81,8 +81,13 @@ class Task(ABC):
     def _positions(self, scene: Scene) -> list[Point]:
         return scene.positions
 
-    def _is_finished(self, scene: Scene, index: int) -> bool:
-        return math.dist(self.positions[index], self.targets[index]) < self.tolerance
+    def _finished(self, scene: Scene) -> list[bool]:
+        """Return which objects are finished, given which were before and where all are now."""
+        tolerance = self.tolerance
+        return [
+            math.dist(position, target) < tolerance
+            for position, target in zip(self.positions, self.targets, strict=True)
+        ]
 
 
 class Reach(Task):
@@ -110,9 +115,12 @@ class Reach(Task):
     def _positions(self, scene: Scene) -> list[Point]:
         return [scene.robot.position] * len(self.targets)
 
-    def _is_finished(self, scene: Scene, index: int) -> bool:
-        # The list is being rebuilt in order, so a target counts only once those before it have been visited.
-        return self.finished[index] or (index == self.focus and super()._is_finished(scene, index))
+    def _finished(self, scene: Scene) -> list[bool]:
+        # A target counts only once those before it have been visited.
+        finished, focus = self.finished, self.focus
+        if finished[focus] or math.dist(self.positions[focus], self.targets[focus]) >= self.tolerance:
+            return finished
+        return [*finished[:focus], True, *finished[focus + 1 :]]
 
 
 class Push(Task):
@@ -223,8 +231,8 @@ class Slide(Task):
         places = zip(self.finished, self.positions, scene.positions, strict=True)
         return [old if finished else new for finished, old, new in places]
 
-    def _is_finished(self, scene: Scene, index: int) -> bool:
-        return self.finished[index] or super()._is_finished(scene, index)
+    def _finished(self, scene: Scene) -> list[bool]:
+        return [old or new for old, new in zip(self.finished, super()._finished(scene), strict=True)]
 
 
 class Stack(Task):
@@ -282,8 +290,8 @@ class Stack(Task):
         free = gripper_z - z > 0.03 or math.hypot(gripper_x - x, gripper_y - y) > 0.06
         return free and math.dist(self.positions[index], self._before[index]) < self.rest_motion
 
-    def _is_finished(self, scene: Scene, index: int) -> bool:
-        return super()._is_finished(scene, index) and self.settled(scene, index)
+    def _finished(self, scene: Scene) -> list[bool]:
+        return [there and self.settled(scene, index) for index, there in enumerate(super()._finished(scene))]
 
 
 def _on_table(starts: Points, targets: Points, height: float) -> tuple[Points, Points]:
