@@ -1,6 +1,6 @@
 """Steps per second of many environments in few processes, against SB3's one process per environment.
 
-    python benchmarks/vec_env_speed.py [--env PandaReach-v0 ...] [--num-envs 16] [--workers 2] [--rounds 5]
+    python benchmarks/vec_env_speed.py [--env PandaReach-v0 ...] [--num-envs 16] [--workers 1] [--rounds 5]
 
 Random actions, environments seeded alike. In every round each candidate runs for the given time, one after the other;
 the table shows medians over the rounds and ratios of them. On a machine that does other work as well, sixteen processes
@@ -57,7 +57,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", nargs="+", default=list(TASKS), help="environment ids")
     parser.add_argument("--num-envs", type=int, default=16, help="environments")
-    parser.add_argument("--workers", type=int, default=2, help="processes of the grouped form")
+    parser.add_argument("--workers", type=int, default=1, help="processes of the grouped form beside this one")
     parser.add_argument("--seconds", type=float, default=2.0, help="how long each candidate runs in a round")
     parser.add_argument("--rounds", type=int, default=5, help="rounds of which the median is taken")
     options = parser.parse_args()
@@ -90,7 +90,7 @@ def print_rows(env_id: str, options: argparse.Namespace) -> None:
         for env in envs.values():
             env.close()
     results = {name: [median(values) for values in zip(*rounds, strict=True)] for name, rounds in measured.items()}
-    processes = {"DummyVecEnv": 1, "SubprocVecEnv": options.num_envs, "GroupedSubprocVecEnv": options.workers}
+    processes = {"DummyVecEnv": 1, "SubprocVecEnv": options.num_envs, "GroupedSubprocVecEnv": options.workers + 1}
     speed, used = results["SubprocVecEnv"]
     for name, (steps, seconds) in results.items():
         print(

@@ -1,4 +1,4 @@
-"""Many simulations in few processes: every worker steps its share of the environments, one message per step."""
+"""Many simulations in few processes: each steps its share of the environments, one message per worker and step."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 import pickle
 import signal
 import sys
+import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
@@ -24,6 +25,10 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 
 _OK, _RAISED, _BROKEN = "ok", "raised", "broken"
 _SECONDS_TO_CLOSE = 5.0
+#: Who waits looks for the message for so long before it goes to sleep; to be woken takes 0.1 to 0.3 ms.
+_SECONDS_AWAKE = 1e-3
+
+EnvFn = Callable[[], gym.Env[Any, Any]]
 
 
 class RemoteTraceback(Exception):
@@ -35,60 +40,62 @@ class RemoteTraceback(Exception):
 
 
 class GroupedSubprocVecEnv(VecEnv):
-    """Runs ``n_envs`` environments in ``n_workers`` processes, each of which steps its share one after the other.
+    """Runs ``n_envs`` environments in ``n_workers`` processes and the calling one, a share of them in each.
 
     SB3's ``SubprocVecEnv`` starts a process for every environment and exchanges a message with each of them at every
-    step; with more environments than cores they wait for one another. Here there are as many processes as cores. Each
-    worker holds a ``DummyVecEnv``, so all results are exactly those of ``DummyVecEnv(env_fns)``; those that carry no
-    news, such as the infos of environments that report nothing, are not sent.
+    step; with more environments than cores they wait for one another. Here there are as many processes as cores, the
+    calling one among them, which would else sleep during a step and have to be woken. Each holds a ``DummyVecEnv``, so
+    all results are exactly those of ``DummyVecEnv(env_fns)``; those that carry no news, such as the infos of
+    environments that report nothing, are not sent.
 
     The workers do not run the calling script again, which therefore needs no ``if __name__ == "__main__":`` block.
     What the environments need from it must be reached from ``env_fns``: an id that the script registers is unknown in
     the workers unless the function registers it.
 
-    :param env_fns: make one environment each; they are called in the workers and sent there by cloudpickle
-    :param n_workers: number of processes, at least 1; by default one for each core. More than ``len(env_fns)`` are
-        not started
+    :param env_fns: make one environment each; they are called where the environment will run, and sent to the workers
+        by cloudpickle. The calling process takes the first ones
+    :param n_workers: number of processes that are started, at least 1; by default one for each core but that of the
+        calling process. More than can have an environment are not started
     :raises ValueError: if there is no environment or no worker, or whatever making an environment raises
     """
 
-    def __init__(self, env_fns: Sequence[Callable[[], gym.Env[Any, Any]]], n_workers: int | None = None) -> None:
+    def __init__(self, env_fns: Sequence[EnvFn], n_workers: int | None = None) -> None:
         if not env_fns:
             raise ValueError("env_fns=[] is not accepted; at least one environment is needed")
         if n_workers is not None and n_workers < 1:
             raise ValueError(f"n_workers={n_workers} is not accepted; it is at least 1")
-        n_workers = min(n_workers or os.cpu_count() or 1, len(env_fns))
-        bounds = np.linspace(0, len(env_fns), n_workers + 1).astype(int).tolist()
+        cores = os.cpu_count() or 1
+        n_shares = min(1 + (n_workers or max(1, cores - 1)), len(env_fns))
+        bounds = np.linspace(0, len(env_fns), n_shares + 1).astype(int).tolist()
         self._shares = [range(*pair) for pair in pairwise(bounds)]
         self._closed = False
         self._owing: list[int] = []
-        self._remotes: list[Connection] = []
-        self.processes: list[Any] = []
+        self._parties: list[_Here | _Worker] = []
         try:
-            self._start([[env_fns[row] for row in share] for share in self._shares])
-            (observation_space, action_space, metadata), *_ = self._ask_all("start", [()] * n_workers)
+            # More processes than cores leave none free for looking whether a message has come.
+            self._start([env_fns[share.start : share.stop] for share in self._shares], n_shares <= cores)
+            (observation_space, action_space, metadata), *_ = self._ask_all("start", [()] * n_shares)
             super().__init__(len(env_fns), observation_space, action_space)
         except BaseException:
             self.close()
             raise
         self.metadata = metadata
 
-    def _start(self, groups: Sequence[Sequence[Callable[[], Any]]]) -> None:
+    def _start(self, groups: Sequence[Sequence[EnvFn]], watchful: bool) -> None:
         forks = "forkserver" in multiprocessing.get_all_start_methods()
         context: Any = multiprocessing.get_context("forkserver" if forks else "spawn")
         if forks:
             # Torch and SB3 are imported once, by the server that all workers are forked from.
             context.set_forkserver_preload([__name__])
-        for number, group in enumerate(groups):
-            remote, worker_remote = context.Pipe()
-            self._remotes.append(remote)
-            process = context.Process(
-                target=_work, args=(worker_remote, cloudpickle.dumps(list(group))), name=f"worker-{number}", daemon=True
-            )
-            with _main_script_hidden():
-                process.start()
-            self.processes.append(process)
-            worker_remote.close()
+        seconds = _SECONDS_AWAKE if watchful else 0.0
+        self._parties.append(_Here(groups[0]))
+        for number, group in enumerate(groups[1:]):
+            self._parties.append(_Worker(context, number, group, seconds))
+
+    @property
+    def processes(self) -> list[Any]:
+        """The processes of the workers."""
+        return [party.process for party in self._parties if isinstance(party, _Worker)]
 
     def reset(self) -> VecEnvObs:
         """Reset every environment, with the seeds and options given since the last reset."""
@@ -104,11 +111,11 @@ class GroupedSubprocVecEnv(VecEnv):
     def step_async(self, actions: NDArray[Any]) -> None:
         """Send every worker the actions of its environments."""
         self._collect(discard=True)
-        for worker, share in enumerate(self._shares):
-            self._send_bytes(worker, pickle.dumps(("step", (actions[share.start : share.stop],), {}), -1))
+        for party, share in enumerate(self._shares):
+            self._send(party, "step", (actions[share.start : share.stop],))
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Wait for all workers."""
+        """Step the environments of this process and wait for the workers."""
         observations, rewards, dones, sent_infos, sent_reset_infos = zip(*self._collect(), strict=True)
         infos: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in range(self.num_envs)]
         for share, some, resets in zip(self._shares, sent_infos, sent_reset_infos, strict=True):
@@ -123,16 +130,10 @@ class GroupedSubprocVecEnv(VecEnv):
         if self._closed:
             return
         self._closed = True
-        for remote in self._remotes:
-            with contextlib.suppress(OSError):
-                remote.send_bytes(cloudpickle.dumps(("close", ())))
-            # A worker that is still sending an answer is freed by this; nobody will read it.
-            remote.close()
-        for process in self.processes:
-            process.join(_SECONDS_TO_CLOSE)
-            if process.is_alive():
-                process.terminate()
-                process.join()
+        for party in reversed(self._parties):  # the workers, before this process is busy with its own environments
+            party.close()
+        for party in self._parties:
+            party.join()
 
     def get_images(self) -> Sequence[NDArray[Any] | None]:
         """Return one picture per environment, ``None`` where the render mode is not ``"rgb_array"``."""
@@ -165,16 +166,15 @@ class GroupedSubprocVecEnv(VecEnv):
         return [range(self.num_envs)[index] for index in self._get_indices(indices)]
 
     def _in_order(self, method: str, rows: Sequence[int], *args: Any, per_row: bool = True, **kwargs: Any) -> list[Any]:
-        """Call a method of the workers' ``DummyVecEnv``, return its results in the order of ``rows``."""
+        """Call a method of the shares' ``DummyVecEnv``, return its results in the order of ``rows``."""
         self._collect(discard=True)
         asked: list[list[int]] = []
-        for worker, share in enumerate(self._shares):
+        for party, share in enumerate(self._shares):
             mine = [row for row in rows if row in share]
             if mine:
                 asked.append(mine)
-                if per_row:
-                    kwargs["indices"] = [row - share.start for row in mine]
-                self._send(worker, method, args, kwargs)
+                indices = {"indices": [row - share.start for row in mine]} if per_row else {}
+                self._send(party, method, args, {**kwargs, **indices})
         answers = self._collect()
         # A row asked for twice has its results in the order in which they were asked for.
         results = [iter(answer or [None] * len(mine)) for answer, mine in zip(answers, asked, strict=True)]
@@ -183,21 +183,18 @@ class GroupedSubprocVecEnv(VecEnv):
 
     def _ask_all(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
         self._collect(discard=True)
-        for worker, args in enumerate(arguments):
-            self._send(worker, method, args)
+        for party, args in enumerate(arguments):
+            self._send(party, method, args)
         return self._collect()
 
-    def _send(self, worker: int, method: str, args: tuple[Any, ...], kwargs: dict[str, Any] | None = None) -> None:
-        self._send_bytes(worker, cloudpickle.dumps((method, args, kwargs or {})))
-
-    def _send_bytes(self, worker: int, message: bytes) -> None:
+    def _send(self, party: int, method: str, args: tuple[Any, ...], kwargs: dict[str, Any] | None = None) -> None:
         if self._closed:
             raise RuntimeError("the environments are closed; make new ones")
         try:
-            self._remotes[worker].send_bytes(message)
+            self._parties[party].send(method, args, kwargs or {})
         except OSError:
-            raise self._death(worker) from None
-        self._owing.append(worker)
+            raise self._death(party) from None
+        self._owing.append(party)
 
     def _collect(self, discard: bool = False) -> list[Any]:
         """Receive the answers that are owed; raise the first error among them when all are in.
@@ -207,7 +204,7 @@ class GroupedSubprocVecEnv(VecEnv):
         answers = []
         while self._owing:
             try:
-                answers.append(self._remotes[self._owing[0]].recv())
+                answers.append(self._parties[self._owing[0]].receive())
             except (EOFError, OSError):
                 raise self._death(self._owing[0]) from None
             self._owing.pop(0)
@@ -216,21 +213,106 @@ class GroupedSubprocVecEnv(VecEnv):
         for kind, value in answers:
             if kind == _RAISED:
                 error, text = value
-                raise error from RemoteTraceback(text)
+                raise error from (RemoteTraceback(text) if text else error.__cause__)
             if kind == _BROKEN:
                 raise RuntimeError(f"an environment failed in its worker:\n{value}")
         return [value for _, value in answers]
 
-    def _death(self, worker: int) -> RuntimeError:
+    def _death(self, party: int) -> RuntimeError:
         """Close everything and return the error that says which worker has died."""
-        process, share = self.processes[worker], self._shares[worker]
-        process.join(_SECONDS_TO_CLOSE)
+        worker, share = self._parties[party], self._shares[party]
+        assert isinstance(worker, _Worker)
+        worker.process.join(_SECONDS_TO_CLOSE)
         self._owing.clear()
         self.close()
         return RuntimeError(
-            f"worker {worker}, which ran environments {share.start} to {share.stop - 1}, has died with exit code "
-            f"{process.exitcode}; the environments are closed"
+            f"worker {worker.number}, which ran environments {share.start} to {share.stop - 1}, has died with exit "
+            f"code {worker.process.exitcode}; the environments are closed"
         )
+
+
+class _Here:
+    """The environments of the calling process; they work while it waits for the answer.
+
+    :param env_fns: make one environment each
+    """
+
+    def __init__(self, env_fns: Sequence[EnvFn]) -> None:
+        self._env_fns = env_fns
+        self._group: _Group | None = None
+        self._asked: tuple[str, tuple[Any, ...], dict[str, Any]] | None = None
+
+    def send(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+        """Take note of a call."""
+        self._asked = method, args, kwargs
+
+    def receive(self) -> tuple[str, Any]:
+        """Make the call and return its result or error; an interrupted call is not made again."""
+        if self._asked is None:
+            return _OK, None
+        (method, args, kwargs), self._asked = self._asked, None
+        try:
+            if self._group is None:
+                self._group = _Group(self._env_fns)
+            return _OK, getattr(self._group, method)(*args, **kwargs)
+        except Exception as error:
+            return _RAISED, (error, None)
+
+    def close(self) -> None:
+        """Close the environments."""
+        if self._group is not None:
+            self._group.venv.close()
+
+    def join(self) -> None:
+        """Do nothing; there is no process to wait for."""
+
+
+class _Worker:
+    """A process and the connection to it.
+
+    :param context: of multiprocessing
+    :param number: of the worker
+    :param env_fns: make one environment each
+    :param seconds_awake: how long it and this process look for a message before they sleep until one comes
+    """
+
+    def __init__(self, context: Any, number: int, env_fns: Sequence[EnvFn], seconds_awake: float) -> None:
+        self.number, self._seconds_awake = number, seconds_awake
+        self._remote, remote_of_worker = context.Pipe()
+        self.process = context.Process(
+            target=_work,
+            args=(remote_of_worker, cloudpickle.dumps(list(env_fns)), seconds_awake),
+            name=f"worker-{number}",
+            daemon=True,
+        )
+        with _main_script_hidden():
+            self.process.start()
+        remote_of_worker.close()
+
+    def send(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+        """Send a call."""
+        # Actions are an array, for which pickle is several times faster; other arguments may come from the main script.
+        dumps = pickle.dumps if method == "step" else cloudpickle.dumps
+        self._remote.send_bytes(dumps((method, args, kwargs)))
+
+    def receive(self) -> Any:
+        """Wait for the answer to a call."""
+        _watch(self._remote, self._seconds_awake)
+        return self._remote.recv()
+
+    def close(self) -> None:
+        """Ask the process to end."""
+        with contextlib.suppress(OSError):
+            self._remote.send_bytes(cloudpickle.dumps(("close", (), {})))
+        # A worker that is still sending an answer is freed by this; nobody will read it.
+        self._remote.close()
+
+    def join(self) -> None:
+        """Wait for the end of the process, or put an end to it."""
+        self.process.join(_SECONDS_TO_CLOSE)
+        if self.process.is_alive():
+            self.process.terminate()
+            self.process.join()
 
 
 class _Uncopied(list[dict[str, Any]]):
@@ -241,14 +323,13 @@ class _Uncopied(list[dict[str, Any]]):
 
 
 class _Group:
-    """The environments of one worker.
+    """The environments of one process.
 
     :param env_fns: make one environment each
     """
 
-    def __init__(self, env_fns: Sequence[Callable[[], Any]]) -> None:
+    def __init__(self, env_fns: Sequence[EnvFn]) -> None:
         self.venv = DummyVecEnv(list(env_fns))
-        self.venv.buf_infos = _Uncopied(self.venv.buf_infos)
 
     def start(self) -> tuple[Any, Any, Any]:
         """Return what the main process has to know."""
@@ -279,27 +360,36 @@ class _Group:
         return getattr(self.venv, name)
 
 
-def _work(remote: Connection, pickled_env_fns: bytes) -> None:
+def _work(remote: Connection, pickled_env_fns: bytes, seconds_awake: float) -> None:
     """Answer the main process until it closes the connection."""
     # Ctrl-C reaches all processes of a terminal; the main one decides what becomes of it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     group: _Group | None = None
     with contextlib.suppress(EOFError, OSError):
         while True:
+            _watch(remote, seconds_awake)
             message = remote.recv_bytes()
             try:
-                method, args, *kwargs = cloudpickle.loads(message)
+                method, args, kwargs = cloudpickle.loads(message)
                 if method == "close":
                     break
                 if group is None:
                     group = _Group(cloudpickle.loads(pickled_env_fns))
-                answer = _pickled((_OK, getattr(group, method)(*args, **kwargs[0])))
+                    group.venv.buf_infos = _Uncopied(group.venv.buf_infos)
+                answer = _pickled((_OK, getattr(group, method)(*args, **kwargs)))
             except Exception as error:
                 answer = _pickled_error(error)
             remote.send_bytes(answer)
     if group is not None:
         group.venv.close()
     remote.close()
+
+
+def _watch(remote: Connection, seconds: float) -> None:
+    """Look for a message for so long, without going to sleep."""
+    end = time.perf_counter() + seconds
+    while time.perf_counter() < end and not remote.poll():
+        pass
 
 
 def _pickled(answer: Any) -> bytes:
