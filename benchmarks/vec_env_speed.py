@@ -1,6 +1,6 @@
 """Steps per second of many environments in few processes, against SB3's one process per environment.
 
-    python benchmarks/vec_env_speed.py [--env PandaReach-v0 ...] [--num-envs 16] [--workers 1] [--rounds 5]
+    python benchmarks/vec_env_speed.py [--env PandaReach-v0 ...] [--num-envs 16] [--rounds 5]
 
 Random actions, environments seeded alike. In every round each candidate runs for the given time, one after the other;
 the table shows medians over the rounds and ratios of them. On a machine that does other work as well, sixteen processes
@@ -13,23 +13,32 @@ from __future__ import annotations
 import argparse
 import os
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from statistics import median
+from typing import Any, cast
 
 import numpy as np
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from progpolicy_envs import DOMAINS
 from sb3_progpolicy.grouped import GroupedSubprocVecEnv
+from sb3_progpolicy.vec_env import make_fast_vec_env
 
 TASKS = [domain.id for domain in DOMAINS.values() if domain.simulation]
+
+
+def workers(env: VecEnv) -> list[Any]:
+    """Return the processes beside this one in which environments run."""
+    return list(getattr(env.unwrapped, "processes", []))
 
 
 def processor_seconds(env: VecEnv) -> float:
     """Return the processor time that this process and the workers of an environment have used so far."""
     ticks = 0
-    for process in getattr(env, "processes", []):
+    for process in workers(env):
         stat = Path(f"/proc/{process.pid}/stat")
         if stat.exists():
             user, system = stat.read_text().rpartition(")")[2].split()[11:13]
@@ -57,7 +66,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", nargs="+", default=list(TASKS), help="environment ids")
     parser.add_argument("--num-envs", type=int, default=16, help="environments")
-    parser.add_argument("--workers", type=int, default=1, help="processes of the grouped form beside this one")
     parser.add_argument("--seconds", type=float, default=2.0, help="how long each candidate runs in a round")
     parser.add_argument("--rounds", type=int, default=5, help="rounds of which the median is taken")
     options = parser.parse_args()
@@ -70,17 +78,20 @@ def main() -> None:
 
 
 def print_rows(env_id: str, options: argparse.Namespace) -> None:
-    """Measure the three forms with one environment id and print a row for each."""
+    """Measure the forms with one environment id and print a row for each."""
     envs: dict[str, VecEnv] = {}
     measured: dict[str, list[tuple[float, float]]] = {}
-    forms: dict[str, tuple[type[VecEnv], dict[str, int]]] = {
-        "DummyVecEnv": (DummyVecEnv, {}),
-        "SubprocVecEnv": (SubprocVecEnv, {}),
-        "GroupedSubprocVecEnv": (GroupedSubprocVecEnv, {"n_workers": options.workers}),
+    forms: dict[str, Callable[[], VecEnv]] = {
+        "DummyVecEnv": partial(make_vec_env, env_id, options.num_envs, seed=0),
+        "SubprocVecEnv": partial(make_vec_env, env_id, options.num_envs, seed=0, vec_env_cls=SubprocVecEnv),
+        "GroupedSubprocVecEnv": partial(
+            make_vec_env, env_id, options.num_envs, seed=0, vec_env_cls=cast(Any, GroupedSubprocVecEnv)
+        ),
+        "make_fast_vec_env": partial(make_fast_vec_env, env_id, options.num_envs, seed=0),
     }
     try:
-        for name, (form, arguments) in forms.items():
-            envs[name] = make_vec_env(env_id, options.num_envs, seed=0, vec_env_cls=form, vec_env_kwargs=arguments)
+        for name, make in forms.items():
+            envs[name] = make()
             envs[name].reset()
             measured[name] = []
         for _ in range(options.rounds):
@@ -89,8 +100,9 @@ def print_rows(env_id: str, options: argparse.Namespace) -> None:
     finally:
         for env in envs.values():
             env.close()
+    # SubprocVecEnv leaves this process nothing to do but to wait.
+    processes = {name: len(workers(env)) + (name != "SubprocVecEnv") for name, env in envs.items()}
     results = {name: [median(values) for values in zip(*rounds, strict=True)] for name, rounds in measured.items()}
-    processes = {"DummyVecEnv": 1, "SubprocVecEnv": options.num_envs, "GroupedSubprocVecEnv": options.workers + 1}
     speed, used = results["SubprocVecEnv"]
     for name, (steps, seconds) in results.items():
         print(

@@ -238,7 +238,7 @@ def _play(
 
 def _optimal_steps(venv: VecEnv) -> NDArray[np.float64]:
     """The planner's steps from the states in which episodes have just begun; meaningless in the middle of one."""
-    if isinstance(venv.unwrapped, BatchedVecEnv):
+    if isinstance(venv.unwrapped, BatchedVecEnv) and venv.has_attr("optimal_steps"):
         return np.asarray(venv.env_method("optimal_steps")[0], dtype=np.float64)
     infos = venv.unwrapped.reset_infos  # SB3's wrappers do not pass them on
     return np.array([info.get("optimal_steps", np.nan) for info in infos], dtype=np.float64)

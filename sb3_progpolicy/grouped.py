@@ -11,7 +11,8 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from itertools import pairwise
+from functools import partial
+from itertools import accumulate, pairwise
 from multiprocessing.connection import Connection
 from types import ModuleType
 from typing import Any
@@ -29,6 +30,7 @@ _SECONDS_TO_CLOSE = 5.0
 _SECONDS_AWAKE = 1e-3
 
 EnvFn = Callable[[], gym.Env[Any, Any]]
+VenvFn = Callable[[], VecEnv]
 
 
 class RemoteTraceback(Exception):
@@ -39,58 +41,52 @@ class RemoteTraceback(Exception):
         return "\n" + str(self.args[0])
 
 
-class GroupedSubprocVecEnv(VecEnv):
-    """Runs ``n_envs`` environments in ``n_workers`` processes and the calling one, a share of them in each.
+class GroupedVecEnv(VecEnv):
+    """Joins several ``VecEnv`` that run side by side: one in the calling process, each other one in its own.
 
-    SB3's ``SubprocVecEnv`` starts a process for every environment and exchanges a message with each of them at every
-    step; with more environments than cores they wait for one another. Here there are as many processes as cores, the
-    calling one among them, which would else sleep during a step and have to be woken. Each holds a ``DummyVecEnv``, so
-    all results are exactly those of ``DummyVecEnv(env_fns)``; those that carry no news, such as the infos of
-    environments that report nothing, are not sent.
+    With as many as there are cores none is idle. The calling process has a share, because it would else sleep during a
+    step and have to be woken. All results are exactly those of the parts; those that carry no news, such as empty
+    infos, are not sent.
 
     The workers do not run the calling script again, which therefore needs no ``if __name__ == "__main__":`` block.
-    What the environments need from it must be reached from ``env_fns``: an id that the script registers is unknown in
+    What the environments need from it must be reached from ``venv_fns``: an id that the script registers is unknown in
     the workers unless the function registers it.
 
-    :param env_fns: make one environment each; they are called where the environment will run, and sent to the workers
-        by cloudpickle. The calling process takes the first ones
-    :param n_workers: number of processes that are started, at least 1; by default one for each core but that of the
-        calling process. More than can have an environment are not started
-    :raises ValueError: if there is no environment or no worker, or whatever making an environment raises
+    :param venv_fns: make one ``VecEnv`` each, all with the same spaces; they are called where it will run, and sent to
+        the workers by cloudpickle. The calling process takes the first
+    :raises ValueError: if there is none, or whatever making an environment raises
     """
 
-    def __init__(self, env_fns: Sequence[EnvFn], n_workers: int | None = None) -> None:
-        if not env_fns:
-            raise ValueError("env_fns=[] is not accepted; at least one environment is needed")
-        if n_workers is not None and n_workers < 1:
-            raise ValueError(f"n_workers={n_workers} is not accepted; it is at least 1")
-        cores = os.cpu_count() or 1
-        n_shares = min(1 + (n_workers or max(1, cores - 1)), len(env_fns))
-        bounds = np.linspace(0, len(env_fns), n_shares + 1).astype(int).tolist()
-        self._shares = [range(*pair) for pair in pairwise(bounds)]
+    def __init__(self, venv_fns: Sequence[VenvFn]) -> None:
+        if not venv_fns:
+            raise ValueError("venv_fns=[] is not accepted; at least one is needed")
         self._closed = False
+        self._shares: list[range] = []
         self._owing: list[int] = []
         self._parties: list[_Here | _Worker] = []
         try:
             # More processes than cores leave none free for looking whether a message has come.
-            self._start([env_fns[share.start : share.stop] for share in self._shares], n_shares <= cores)
-            (observation_space, action_space, metadata), *_ = self._ask_all("start", [()] * n_shares)
-            super().__init__(len(env_fns), observation_space, action_space)
+            self._start(venv_fns, watchful=len(venv_fns) <= (os.cpu_count() or 1))
+            (first, *_), sizes = zip(*self._ask_all("start", [()] * len(venv_fns)), strict=True)
+            observation_space, action_space, metadata = first
+            bounds = [0, *accumulate(sizes)]
+            self._shares = [range(*pair) for pair in pairwise(bounds)]
+            super().__init__(bounds[-1], observation_space, action_space)
         except BaseException:
             self.close()
             raise
         self.metadata = metadata
 
-    def _start(self, groups: Sequence[Sequence[EnvFn]], watchful: bool) -> None:
+    def _start(self, venv_fns: Sequence[VenvFn], watchful: bool) -> None:
         forks = "forkserver" in multiprocessing.get_all_start_methods()
         context: Any = multiprocessing.get_context("forkserver" if forks else "spawn")
         if forks:
             # Torch and SB3 are imported once, by the server that all workers are forked from.
             context.set_forkserver_preload([__name__])
         seconds = _SECONDS_AWAKE if watchful else 0.0
-        self._parties.append(_Here(groups[0]))
-        for number, group in enumerate(groups[1:]):
-            self._parties.append(_Worker(context, number, group, seconds))
+        self._parties.append(_Here(venv_fns[0]))
+        for number, venv_fn in enumerate(venv_fns[1:]):
+            self._parties.append(_Worker(context, number, venv_fn, seconds))
 
     @property
     def processes(self) -> list[Any]:
@@ -166,7 +162,7 @@ class GroupedSubprocVecEnv(VecEnv):
         return [range(self.num_envs)[index] for index in self._get_indices(indices)]
 
     def _in_order(self, method: str, rows: Sequence[int], *args: Any, per_row: bool = True, **kwargs: Any) -> list[Any]:
-        """Call a method of the shares' ``DummyVecEnv``, return its results in the order of ``rows``."""
+        """Call a method of the parts, return its results in the order of ``rows``."""
         self._collect(discard=True)
         asked: list[list[int]] = []
         for party, share in enumerate(self._shares):
@@ -220,25 +216,61 @@ class GroupedSubprocVecEnv(VecEnv):
 
     def _death(self, party: int) -> RuntimeError:
         """Close everything and return the error that says which worker has died."""
-        worker, share = self._parties[party], self._shares[party]
+        worker = self._parties[party]
         assert isinstance(worker, _Worker)
         worker.process.join(_SECONDS_TO_CLOSE)
         self._owing.clear()
         self.close()
+        share = self._shares[party] if self._shares else None
+        what = f"which ran environments {share.start} to {share.stop - 1}, " if share else ""
         return RuntimeError(
-            f"worker {worker.number}, which ran environments {share.start} to {share.stop - 1}, has died with exit "
-            f"code {worker.process.exitcode}; the environments are closed"
+            f"worker {worker.number}, {what}has died with exit code {worker.process.exitcode}; "
+            "the environments are closed"
         )
 
 
-class _Here:
-    """The environments of the calling process; they work while it waits for the answer.
+class GroupedSubprocVecEnv(GroupedVecEnv):
+    """Runs ``n_envs`` environments in ``n_workers`` processes and the calling one, a share of them in each.
+
+    SB3's ``SubprocVecEnv`` starts a process for every environment and exchanges a message with each of them at every
+    step; with more environments than cores they wait for one another. Here there are as many processes as cores. Each
+    holds a ``DummyVecEnv``, so all results are exactly those of ``DummyVecEnv(env_fns)``. For the rest see
+    :class:`GroupedVecEnv`.
 
     :param env_fns: make one environment each
+    :param n_workers: number of processes that are started, at least 1; by default one for each core but that of the
+        calling process. More than can have an environment are not started
+    :raises ValueError: if there is no environment or no worker, or whatever making an environment raises
     """
 
-    def __init__(self, env_fns: Sequence[EnvFn]) -> None:
-        self._env_fns = env_fns
+    def __init__(self, env_fns: Sequence[EnvFn], n_workers: int | None = None) -> None:
+        if not env_fns:
+            raise ValueError("env_fns=[] is not accepted; at least one environment is needed")
+        if n_workers is not None and n_workers < 1:
+            raise ValueError(f"n_workers={n_workers} is not accepted; it is at least 1")
+        n_shares = 1 + (n_workers or max(1, (os.cpu_count() or 1) - 1))
+        shares = even_shares(len(env_fns), n_shares)
+        super().__init__([partial(DummyVecEnv, list(env_fns[share.start : share.stop])) for share in shares])
+
+
+def even_shares(n_envs: int, n_shares: int) -> list[range]:
+    """Return which environments each of several processes takes, none of them none.
+
+    :param n_envs: number of environments, at least 1
+    :param n_shares: number of processes
+    """
+    bounds = np.linspace(0, n_envs, min(n_shares, n_envs) + 1).astype(int).tolist()
+    return [range(*pair) for pair in pairwise(bounds)]
+
+
+class _Here:
+    """The part that runs in the calling process; it works while that waits for the answer.
+
+    :param venv_fn: makes it
+    """
+
+    def __init__(self, venv_fn: VenvFn) -> None:
+        self._venv_fn = venv_fn
         self._group: _Group | None = None
         self._asked: tuple[str, tuple[Any, ...], dict[str, Any]] | None = None
 
@@ -253,7 +285,7 @@ class _Here:
         (method, args, kwargs), self._asked = self._asked, None
         try:
             if self._group is None:
-                self._group = _Group(self._env_fns)
+                self._group = _Group(self._venv_fn())
             return _OK, getattr(self._group, method)(*args, **kwargs)
         except Exception as error:
             return _RAISED, (error, None)
@@ -268,20 +300,20 @@ class _Here:
 
 
 class _Worker:
-    """A process and the connection to it.
+    """A process with one part, and the connection to it.
 
     :param context: of multiprocessing
     :param number: of the worker
-    :param env_fns: make one environment each
+    :param venv_fn: makes the part
     :param seconds_awake: how long it and this process look for a message before they sleep until one comes
     """
 
-    def __init__(self, context: Any, number: int, env_fns: Sequence[EnvFn], seconds_awake: float) -> None:
+    def __init__(self, context: Any, number: int, venv_fn: VenvFn, seconds_awake: float) -> None:
         self.number, self._seconds_awake = number, seconds_awake
         self._remote, remote_of_worker = context.Pipe()
         self.process = context.Process(
             target=_work,
-            args=(remote_of_worker, cloudpickle.dumps(list(env_fns)), seconds_awake),
+            args=(remote_of_worker, cloudpickle.dumps(venv_fn), seconds_awake),
             name=f"worker-{number}",
             daemon=True,
         )
@@ -323,17 +355,18 @@ class _Uncopied(list[dict[str, Any]]):
 
 
 class _Group:
-    """The environments of one process.
+    """The part of one process.
 
-    :param env_fns: make one environment each
+    :param venv: the part
     """
 
-    def __init__(self, env_fns: Sequence[EnvFn]) -> None:
-        self.venv = DummyVecEnv(list(env_fns))
+    def __init__(self, venv: VecEnv) -> None:
+        self.venv = venv
 
-    def start(self) -> tuple[Any, Any, Any]:
+    def start(self) -> tuple[tuple[Any, Any, Any], int]:
         """Return what the main process has to know."""
-        return self.venv.observation_space, self.venv.action_space, self.venv.metadata
+        venv = self.venv
+        return (venv.observation_space, venv.action_space, getattr(venv, "metadata", {})), venv.num_envs
 
     def reset(self, seeds: list[int | None], options: list[dict[str, Any]]) -> tuple[VecEnvObs, list[dict[str, Any]]]:
         """Reset with seeds and options, one for each environment."""
@@ -344,7 +377,7 @@ class _Group:
         """Step; return infos and reset infos by row, only where they say something new."""
         observations, rewards, dones, infos = self.venv.step(actions)
         # DummyVecEnv puts "TimeLimit.truncated" into every info; alone and False it says nothing.
-        some = {row: info for row, info in enumerate(infos) if len(info) > 1 or info["TimeLimit.truncated"]}
+        some = {row: info for row, info in enumerate(infos) if len(info) > 1 or info.get("TimeLimit.truncated")}
         resets = {row: self.venv.reset_infos[row] for row in np.flatnonzero(dones).tolist()}
         return observations, rewards, dones, some, resets
 
@@ -360,7 +393,7 @@ class _Group:
         return getattr(self.venv, name)
 
 
-def _work(remote: Connection, pickled_env_fns: bytes, seconds_awake: float) -> None:
+def _work(remote: Connection, pickled_venv_fn: bytes, seconds_awake: float) -> None:
     """Answer the main process until it closes the connection."""
     # Ctrl-C reaches all processes of a terminal; the main one decides what becomes of it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -374,8 +407,9 @@ def _work(remote: Connection, pickled_env_fns: bytes, seconds_awake: float) -> N
                 if method == "close":
                     break
                 if group is None:
-                    group = _Group(cloudpickle.loads(pickled_env_fns))
-                    group.venv.buf_infos = _Uncopied(group.venv.buf_infos)
+                    group = _Group(cloudpickle.loads(pickled_venv_fn)())
+                    if isinstance(group.venv, DummyVecEnv):
+                        group.venv.buf_infos = _Uncopied(group.venv.buf_infos)
                 answer = _pickled((_OK, getattr(group, method)(*args, **kwargs)))
             except Exception as error:
                 answer = _pickled_error(error)

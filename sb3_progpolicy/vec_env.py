@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from importlib import import_module
 from typing import Any
 
@@ -16,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from progpolicy_envs import DOMAINS
-from sb3_progpolicy.grouped import GroupedSubprocVecEnv
+from sb3_progpolicy.grouped import GroupedSubprocVecEnv, GroupedVecEnv, even_shares
 
 
 class BatchedVecEnv(VecEnv):
@@ -103,8 +104,10 @@ class BatchedVecEnv(VecEnv):
 def make_fast_vec_env(env_id: str, n_envs: int, seed: int | None = None, **env_kwargs: Any) -> VecEnv:
     """Build the fastest vectorised environment of an id, monitored.
 
-    The batched form is taken where the id has one that resets within the step. Several environments of a domain that
-    is a simulation share as many processes as there are cores; all others run in this process, one after the other.
+    The batched form is taken where the id has one that resets within the step; several environments of a domain that
+    is a simulation are batched in as many processes as there are cores. All others run in this process, one after the
+    other, and so do the goal forms of the simulations, in as many processes: a replay buffer needs their infos of every
+    step, which a batch gives only where an episode ends.
 
     :param env_id: a registered id, with or without a module prefix
     :param n_envs: number of environments, at least 1
@@ -116,16 +119,36 @@ def make_fast_vec_env(env_id: str, n_envs: int, seed: int | None = None, **env_k
     module, _, name = env_id.rpartition(":")
     if module:
         import_module(module)  # registers the id; gym.spec does not know the prefix
-    spec = gym.spec(name)
-    if spec.vector_entry_point is not None:
-        batch = gym.make_vec(env_id, num_envs=n_envs, vectorization_mode="vector_entry_point", **env_kwargs)
-        if batch.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP:
-            venv: VecEnv = BatchedVecEnv(batch)
-            venv.seed(seed)
-            return VecMonitor(venv)
-        batch.close()
-    domain = DOMAINS.get(env_id.rpartition(":")[2])
-    grouped = domain is not None and domain.simulation and min(n_envs, os.cpu_count() or 1) > 1
+    domain = DOMAINS.get(name)
+    simulation = domain is not None and domain.simulation
+    n_processes = min(n_envs, os.cpu_count() or 1) if simulation else 1
+    venv: VecEnv | None = None
+    if gym.spec(name).vector_entry_point is not None and not (simulation and env_kwargs.get("observation") == "goal"):
+        if n_processes > 1:
+            shares = even_shares(n_envs, n_processes)
+            venv = GroupedVecEnv([partial(_simulations, env_id, len(share), env_kwargs) for share in shares])
+        else:
+            venv = _batch(env_id, n_envs, env_kwargs)
+    if venv is not None:
+        venv.seed(seed)
+        return VecMonitor(venv)
     # SB3 names its own two classes here and takes any other.
-    vec_env_cls: Any = GroupedSubprocVecEnv if grouped else DummyVecEnv
+    vec_env_cls: Any = GroupedSubprocVecEnv if n_processes > 1 else DummyVecEnv
     return make_vec_env(env_id, n_envs=n_envs, seed=seed, env_kwargs=env_kwargs, vec_env_cls=vec_env_cls)
+
+
+def _batch(env_id: str, n_envs: int, env_kwargs: Mapping[str, Any]) -> BatchedVecEnv | None:
+    """Return the batched form of an id, ``None`` if it does not reset within the step."""
+    batch = gym.make_vec(env_id, num_envs=n_envs, vectorization_mode="vector_entry_point", **env_kwargs)
+    try:
+        return BatchedVecEnv(batch)
+    except ValueError:
+        batch.close()
+        return None
+
+
+def _simulations(env_id: str, n_envs: int, env_kwargs: Mapping[str, Any]) -> VecEnv:
+    """Return the batch of one process, of a domain that has one."""
+    batch = _batch(env_id, n_envs, env_kwargs)
+    assert batch is not None
+    return batch

@@ -14,11 +14,11 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, is_vecenv_wrapped
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_progpolicy import vec_env
-from sb3_progpolicy.grouped import GroupedSubprocVecEnv, RemoteTraceback
-from sb3_progpolicy.vec_env import make_fast_vec_env
+from sb3_progpolicy.grouped import GroupedSubprocVecEnv, GroupedVecEnv, RemoteTraceback
+from sb3_progpolicy.vec_env import BatchedVecEnv, make_fast_vec_env
 
 N_ENVS = 5
 PLACES = {
@@ -304,22 +304,34 @@ def test_no_more_workers_than_environments_and_even_shares():
     env.close()
 
 
-def test_simulations_are_grouped_and_equal_single_ones(monkeypatch):
+@pytest.mark.parametrize(
+    ("arguments", "kind"), [({}, GroupedVecEnv), ({"observation": "goal"}, GroupedSubprocVecEnv)], ids=["flat", "goal"]
+)
+def test_simulations_are_grouped_and_equal_single_ones(monkeypatch, arguments, kind):
     monkeypatch.setattr(vec_env.os, "cpu_count", lambda: 2)
     options = [{"n_targets": n} for n in (1, 2, 3)]
-    grouped, single = make_fast_vec_env("PandaReach-v0", 3, seed=5), make_vec_env("PandaReach-v0", 3, seed=5)
+    arguments = {**arguments, "max_episode_steps": 15}
+    grouped = make_fast_vec_env("PandaReach-v0", 3, seed=5, **arguments)
+    single = make_vec_env("PandaReach-v0", 3, seed=5, env_kwargs=arguments)
     try:
-        assert isinstance(grouped, GroupedSubprocVecEnv)
-        assert len(grouped.processes) == 1
-        assert grouped.env_is_wrapped(Monitor) == [True] * 3
+        assert type(grouped.unwrapped) is kind
+        assert len(grouped.unwrapped.processes) == 1
         for env in (grouped, single):
             env.set_options(options)
-        np.testing.assert_array_equal(grouped.reset(), single.reset())
+        np.testing.assert_equal(grouped.reset(), single.reset())
         rng = np.random.default_rng(0)
-        for _ in range(20):
+        for _ in range(40):
             actions = rng.uniform(-1, 1, (3, 4)).astype(np.float32)
             a, b = grouped.step(actions), single.step(actions)
-            np.testing.assert_equal((*a[:3], without_time(a[3])), (*b[:3], without_time(b[3])))
+            np.testing.assert_equal(a[:3], b[:3])
+            for row in np.flatnonzero(b[2]):
+                info_a, info_b = a[3][row], b[3][row]
+                for key in ("is_success", "TimeLimit.truncated", "terminal_observation"):
+                    np.testing.assert_equal(info_a[key], info_b[key])
+                assert info_a["episode"]["l"] == info_b["episode"]["l"]
+                assert info_a["episode"]["r"] == pytest.approx(info_b["episode"]["r"], abs=1e-4)
+            if kind is GroupedSubprocVecEnv:
+                np.testing.assert_equal(without_time(a[3]), without_time(b[3]))
     finally:
         grouped.close()
         single.close()
@@ -329,6 +341,5 @@ def test_simulations_are_grouped_and_equal_single_ones(monkeypatch):
 def test_one_simulation_or_one_core_needs_no_process(monkeypatch, env_id, n_envs, cores):
     monkeypatch.setattr(vec_env.os, "cpu_count", lambda: cores)
     env = make_fast_vec_env(env_id, n_envs)
-    assert isinstance(env, DummyVecEnv)
-    assert not is_vecenv_wrapped(env, GroupedSubprocVecEnv)
+    assert isinstance(env.unwrapped, BatchedVecEnv)
     env.close()

@@ -9,14 +9,14 @@ from progpolicy_envs.domains import DOMAINS, HIKING_EGOCENTRIC, Domain, get_doma
 
 MAX_EPISODE_STEPS = 500
 
-_ENTRY_POINTS: dict[str, tuple[str, str | None]] = {
+_ENTRY_POINTS: dict[str, tuple[str, str]] = {
     "Hanoi-v0": ("progpolicy_envs.hanoi:HanoiEnv", "progpolicy_envs.hanoi:HanoiVectorEnv"),
     "Hiking-v0": ("progpolicy_envs.hiking:HikingEnv", "progpolicy_envs.hiking:HikingVectorEnv"),
     "Stacking-v0": ("progpolicy_envs.stacking:StackingEnv", "progpolicy_envs.stacking:StackingVectorEnv"),
-    "PandaReach-v0": ("progpolicy_envs.panda:PandaReachEnv", None),
-    "PandaPush-v0": ("progpolicy_envs.panda:PandaPushEnv", None),
-    "PandaSlide-v0": ("progpolicy_envs.panda:PandaSlideEnv", None),
-    "PandaStack-v0": ("progpolicy_envs.panda:PandaStackEnv", None),
+    "PandaReach-v0": ("progpolicy_envs.panda:PandaReachEnv", "progpolicy_envs.panda.vector:PandaReachVectorEnv"),
+    "PandaPush-v0": ("progpolicy_envs.panda:PandaPushEnv", "progpolicy_envs.panda.vector:PandaPushVectorEnv"),
+    "PandaSlide-v0": ("progpolicy_envs.panda:PandaSlideEnv", "progpolicy_envs.panda.vector:PandaSlideVectorEnv"),
+    "PandaStack-v0": ("progpolicy_envs.panda:PandaStackEnv", "progpolicy_envs.panda.vector:PandaStackVectorEnv"),
 }
 
 

@@ -300,7 +300,7 @@ class HanoiVectorEnv(PlanningVectorEnv):
         self._bits[rows, self._source[rows]] = self._full[rows]
         self._tops[rows] = self._TOP[self._bits[rows]]
 
-    def _apply(self, actions: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def _move(self, actions: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         rows, source, target = self._rows, self._FROM[actions], self._TO[actions]
         moved, under = self._tops[rows, source], self._tops[rows, target]
         legal = moved < under

@@ -297,7 +297,7 @@ class HikingVectorEnv(PlanningVectorEnv):
             self._layouts[row], self._stars[row] = layout, stars
             self._hikers[row], self._stars_left[row] = layout.start, len(stars)
 
-    def _apply(self, actions: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def _move(self, actions: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         rows, hikers = self._rows, self._hikers
         ahead = NEIGHBOURS[hikers, actions]
         shown = self._cells[rows, self._places[ahead]]

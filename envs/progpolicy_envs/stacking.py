@@ -229,7 +229,7 @@ class StackingVectorEnv(PlanningVectorEnv):
         self._n_picked[rows] = 0
         self._show_grippers()
 
-    def _apply(self, actions: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def _move(self, actions: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         moved = self._grippers + self._MOVES[actions]
         self._grippers = np.clip(moved, 0, N_SIDE - 1)
         self._show_grippers()

@@ -1,4 +1,4 @@
-"""The batched form shared by the planning domains: NumPy arrays over N environments, no Python loop over them."""
+"""What batched environments have in common: variations and seeds by row, and a reset within the step that ends one."""
 
 from __future__ import annotations
 
@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from progpolicy_envs.variation import Variation, VariationSpace
 
+Infos = dict[str, NDArray[Any]]
 
-class PlanningVectorEnv(VectorEnv, ABC):
-    """N environments stepped by array operations, reset within the step in which their episode ends.
 
-    A subclass keeps its state in arrays whose first axis is the environment and implements :meth:`_reset_rows`,
-    :meth:`_apply` and :meth:`_observe`.
+class DomainVectorEnv(VectorEnv, ABC):
+    """N environments of one task domain, reset within the step in which their episode ends.
 
     Autoreset is ``SAME_STEP``: where an episode ends, the returned observation opens the next one and
     ``infos["final_obs"][i]`` holds the last observation of the ended one, ``infos["is_success"][i]`` whether it
@@ -27,7 +26,7 @@ class PlanningVectorEnv(VectorEnv, ABC):
 
     :param num_envs: number of environments
     :param observation_space: of one environment
-    :param action_space: of one environment (``Discrete``)
+    :param action_space: of one environment
     :param variation: the variation in force in every environment
     :param max_episode_steps: steps after which an episode is truncated; ``None`` for no limit
     """
@@ -43,8 +42,7 @@ class PlanningVectorEnv(VectorEnv, ABC):
         variation: Variation,
         max_episode_steps: int | None,
     ) -> None:
-        if num_envs < 1:
-            raise ValueError(f"num_envs={num_envs} is not accepted; it is at least 1")
+        check_num_envs(num_envs)
         self.num_envs = num_envs
         self.single_observation_space = observation_space
         self.single_action_space = action_space
@@ -58,7 +56,7 @@ class PlanningVectorEnv(VectorEnv, ABC):
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    ) -> tuple[Any, Infos]:
         """Start a new episode in every environment.
 
         :param seed: environment ``i`` gets ``seed + i``, or ``seed[i]`` of a sequence; ``None`` keeps its generator
@@ -71,63 +69,52 @@ class PlanningVectorEnv(VectorEnv, ABC):
             self._set_variations(options)
         self._elapsed[:] = 0
         self._reset_rows(self._rows)
-        infos = {
-            "variation": np.array([dict(variation) for variation in self.row_variations], dtype=object),
-            "optimal_steps": self._optimal_steps(),
-            "is_success": np.zeros(self.num_envs, dtype=bool),
-        }
-        return self._observe(), infos
+        return self._observe(), self._reset_infos()
 
     def step(
-        self, actions: NDArray[np.integer]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        self, actions: NDArray[Any]
+    ) -> tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Infos]:
         """Apply one action in every environment.
 
-        :param actions: ``(num_envs,)`` integers, each in the single action space
+        :param actions: ``(num_envs, *action)``, each in the single action space
         :return: observations, rewards, terminated, truncated, infos
-        :raises ValueError: if ``actions`` has the wrong shape or holds an action out of range
+        :raises ValueError: if ``actions`` has the wrong shape or holds an action that is not accepted
         """
-        actions = np.asarray(actions)
-        n_actions = self.single_action_space.n  # type: ignore[attr-defined]
-        if actions.shape != (self.num_envs,) or actions.min() < 0 or actions.max() >= n_actions:
-            raise ValueError(
-                f"actions of shape {actions.shape} and values {actions!r} are not accepted; "
-                f"needed: shape ({self.num_envs},), integers from 0 to {n_actions - 1}"
-            )
-        rewards, terminated = self._apply(actions)
+        rewards, terminated, infos = self._apply(self._checked(np.asarray(actions)))
         self._elapsed += 1
         truncated = (self._elapsed >= self.max_episode_steps) & ~terminated
         observations = self._observe()
-        infos: dict[str, Any] = {"is_success": terminated}
         (ended,) = (terminated | truncated).nonzero()
         if len(ended):
             infos["final_obs"] = np.full(self.num_envs, None, dtype=object)
             for row in ended:
-                infos["final_obs"][row] = observations[row].copy()
+                infos["final_obs"][row] = _of_row(observations, int(row))
             self._elapsed[ended] = 0
             self._reset_rows(ended)
             observations = self._observe()
         return observations, rewards, terminated, truncated, infos
 
-    def optimal_steps(self) -> NDArray[np.int64]:
-        """Return how many steps the planner needs from each environment's present state, ``(num_envs,)``."""
-        return self._optimal_steps()
+    @abstractmethod
+    def _checked(self, actions: NDArray[Any]) -> NDArray[Any]:
+        """Return the actions, or raise ``ValueError``."""
 
     @abstractmethod
     def _reset_rows(self, rows: NDArray[np.intp]) -> None:
         """Put the given environments into a starting state of their variation."""
 
     @abstractmethod
-    def _apply(self, actions: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Change the state by one action each; return rewards and whether the goal is reached."""
+    def _apply(self, actions: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.bool_], Infos]:
+        """Change the state by one action each; return rewards, whether an end is reached, and infos."""
 
     @abstractmethod
-    def _observe(self) -> NDArray[np.float32]:
-        """Return the observations ``(num_envs, *observation)`` in an array of their own."""
+    def _observe(self) -> Any:
+        """Return the observations ``(num_envs, *observation)`` in arrays of their own."""
 
-    @abstractmethod
-    def _optimal_steps(self) -> NDArray[np.int64]:
-        """Return the planner's number of steps from each environment's present state."""
+    def _reset_infos(self) -> Infos:
+        return {
+            "variation": np.array([dict(variation) for variation in self.row_variations], dtype=object),
+            "is_success": np.zeros(self.num_envs, dtype=bool),
+        }
 
     def _seed_rows(self, seed: int | Sequence[int | None] | None) -> None:
         if seed is None:
@@ -156,3 +143,52 @@ class PlanningVectorEnv(VectorEnv, ABC):
     def check_variation(variation: Variation) -> Variation:
         """Return ``variation``; a subclass raises ``ValueError`` where its values do not fit together."""
         return variation
+
+
+class PlanningVectorEnv(DomainVectorEnv):
+    """N environments of a planning domain, stepped by array operations.
+
+    A subclass keeps its state in arrays whose first axis is the environment and implements :meth:`_reset_rows`,
+    :meth:`_move`, :meth:`_observe` and :meth:`_optimal_steps`.
+    """
+
+    def optimal_steps(self) -> NDArray[np.int64]:
+        """Return how many steps the planner needs from each environment's present state, ``(num_envs,)``."""
+        return self._optimal_steps()
+
+    @abstractmethod
+    def _move(self, actions: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Change the state by one action each; return rewards and whether the goal is reached."""
+
+    @abstractmethod
+    def _optimal_steps(self) -> NDArray[np.int64]:
+        """Return the planner's number of steps from each environment's present state."""
+
+    def _checked(self, actions: NDArray[Any]) -> NDArray[Any]:
+        n_actions = self.single_action_space.n  # type: ignore[attr-defined]
+        if actions.shape != (self.num_envs,) or actions.min() < 0 or actions.max() >= n_actions:
+            raise ValueError(
+                f"actions of shape {actions.shape} and values {actions!r} are not accepted; "
+                f"needed: shape ({self.num_envs},), integers from 0 to {n_actions - 1}"
+            )
+        return actions
+
+    def _apply(self, actions: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.bool_], Infos]:
+        rewards, solved = self._move(actions)
+        return rewards, solved, {"is_success": solved}
+
+    def _reset_infos(self) -> Infos:
+        return {**super()._reset_infos(), "optimal_steps": self._optimal_steps()}
+
+
+def check_num_envs(num_envs: int) -> None:
+    """Raise ``ValueError`` for a number of environments below 1."""
+    if num_envs < 1:
+        raise ValueError(f"num_envs={num_envs} is not accepted; it is at least 1")
+
+
+def _of_row(observations: Any, row: int) -> Any:
+    """Return a copy of one environment's observation."""
+    if isinstance(observations, dict):
+        return {key: values[row].copy() for key, values in observations.items()}
+    return observations[row].copy()

@@ -131,10 +131,20 @@ class PandaEnv(gym.Env[Any, NDArray[np.float32]]):
         numbers = action.tolist()
         if action.shape != (len(ACTION_NAMES),) or not all(map(math.isfinite, numbers)):
             raise ValueError(f"action={action!r} is not accepted; an action is 4 finite numbers from -1 to 1")
+        self.scene.robot.act(numbers)
+        self.scene.simulate()
+        observation, reward, info = self.conclude()
+        self._show()
+        return observation, reward, info["is_success"] or info["is_failure"], False, info
+
+    def conclude(self) -> tuple[Observation, float, dict[str, Any]]:
+        """Take over what came of the physics of a step; the last of a step's three parts.
+
+        :return: observation, reward, info
+        """
         task, index, achieved, n_left = self.task, self._focus, self._achieved, self._n_left
         reach = self._reach
-        self.scene.robot.act(numbers)
-        self.scene.step()
+        self.scene.take_over()
         task.update(self.scene)
         failure = task.failed
         self._reach = self._handle_distance(index)
@@ -146,17 +156,15 @@ class PandaEnv(gym.Env[Any, NDArray[np.float32]]):
             target = task.targets[index]
             shaping += PROGRESS * (math.dist(achieved, target) - math.dist(task.positions[index], target))
             achieved = self._achieved
-        success = self._n_left == 0
         info = {
-            "is_success": success,
+            "is_success": self._n_left == 0,
             "is_failure": failure,
             "settled": task.settled(self.scene, self._focus),
             "previous_achieved_goal": achieved,
             "shaping": shaping,
         }
-        self._show()
         observation = self._observe()
-        return observation, self._reward(observation, info), success or failure, False, info
+        return observation, self._reward(observation, info), info
 
     def render(self) -> Any:
         """Return a picture ``(360, 480, 3)`` of bytes, or show a window, as ``render_mode`` says."""

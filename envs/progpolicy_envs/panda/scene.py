@@ -249,10 +249,18 @@ class Scene:
         self._activate(body, pybullet.ACTIVATION_STATE_SLEEP)
 
     def step(self) -> None:
-        """Simulate one control step."""
+        """Simulate one control step and take over what comes of it."""
+        self.simulate()
+        self.take_over()
+
+    def simulate(self) -> None:
+        """Compute the physics of one control step."""
         step, client = pybullet.stepSimulation, self.client
         for _ in self._calls:
             step(client)
+
+    def take_over(self) -> None:
+        """Read the state after the physics and let things that lie still fall asleep."""
         before = self.positions
         self.read()
         if self.physics.sleeping and before:

@@ -1,0 +1,120 @@
+"""The batched form of the Panda environments: several simulations in one process, each part of a step for all of them.
+
+A step of one environment evicts much of Python from the processor's caches while it computes the physics, and the
+other way round. So first all arms get their commands, then the physics of all are computed, then all are read.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from progpolicy_envs.panda import PandaEnv, PandaPushEnv, PandaReachEnv, PandaSlideEnv, PandaStackEnv
+from progpolicy_envs.panda.env import Observation
+from progpolicy_envs.variation import VariationSpace
+from progpolicy_envs.vector import DomainVectorEnv, Infos, check_num_envs
+
+
+class PandaVectorEnv(DomainVectorEnv):
+    """N simulations stepped together, equal to N single environments step for step.
+
+    A subclass names the single form. ``infos`` of a step hold what a single one's info does, in arrays.
+
+    :param num_envs: number of environments
+    :param max_episode_steps: steps after which an episode is truncated; ``None`` for no limit
+    :param render_mode: ``None`` or ``"rgb_array"``
+    :param arguments: of the single form
+    """
+
+    metadata: dict[str, Any] = {
+        **PandaEnv.metadata,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+        "render_modes": ["rgb_array"],
+    }
+    env_class: ClassVar[type[PandaEnv]]
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+        **arguments: Any,
+    ) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode={render_mode!r} is not accepted; a batch has None or 'rgb_array'")
+        check_num_envs(num_envs)
+        self.render_mode = render_mode
+        self.envs = [self.env_class(render_mode=render_mode, **arguments) for _ in range(num_envs)]
+        first = self.envs[0]
+        super().__init__(num_envs, first.observation_space, first.action_space, first.variation, max_episode_steps)
+        self._observations: list[Observation] = [np.empty(0, np.float32)] * num_envs
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Return a picture of each environment, as its single form draws it; ``None`` without a render mode."""
+        return tuple(env.render() for env in self.envs) if self.render_mode else None
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Leave PyBullet."""
+        for env in self.envs:
+            env.close()
+
+    def _checked(self, actions: NDArray[Any]) -> NDArray[Any]:
+        if actions.shape != self.action_space.shape or not np.isfinite(actions).all():
+            raise ValueError(
+                f"actions of shape {actions.shape} and values {actions!r} are not accepted; "
+                f"needed: shape {self.action_space.shape}, finite numbers from -1 to 1"
+            )
+        return actions.astype(np.float32)
+
+    def _apply(self, actions: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.bool_], Infos]:
+        for env, numbers in zip(self.envs, actions.tolist(), strict=True):
+            env.scene.robot.act(numbers)
+        for env in self.envs:
+            env.scene.simulate()
+        observations, rewards, infos = zip(*[env.conclude() for env in self.envs], strict=True)
+        self._observations = list(observations)
+        batch = {name: np.array([info[name] for info in infos]) for name in infos[0]}
+        return np.array(rewards), batch["is_success"] | batch["is_failure"], batch
+
+    def _observe(self) -> Any:
+        rows: list[Any] = self._observations
+        if isinstance(rows[0], dict):
+            return {key: np.array([row[key] for row in rows]) for key in rows[0]}
+        return np.array(rows)
+
+    def _reset_rows(self, rows: NDArray[np.intp]) -> None:
+        for row in rows:
+            env = self.envs[row]
+            env.np_random = self._generators[row]
+            self._observations[row] = env.reset(options=dict(self.row_variations[row]))[0]
+
+
+class PandaReachVectorEnv(PandaVectorEnv):
+    """N :class:`~progpolicy_envs.panda.PandaReachEnv`; see :class:`PandaVectorEnv`."""
+
+    env_class: ClassVar[type[PandaEnv]] = PandaReachEnv
+    variations: ClassVar[VariationSpace] = PandaReachEnv.variations
+
+
+class PandaPushVectorEnv(PandaVectorEnv):
+    """N :class:`~progpolicy_envs.panda.PandaPushEnv`; see :class:`PandaVectorEnv`."""
+
+    env_class: ClassVar[type[PandaEnv]] = PandaPushEnv
+    variations: ClassVar[VariationSpace] = PandaPushEnv.variations
+
+
+class PandaSlideVectorEnv(PandaVectorEnv):
+    """N :class:`~progpolicy_envs.panda.PandaSlideEnv`; see :class:`PandaVectorEnv`."""
+
+    env_class: ClassVar[type[PandaEnv]] = PandaSlideEnv
+    variations: ClassVar[VariationSpace] = PandaSlideEnv.variations
+
+
+class PandaStackVectorEnv(PandaVectorEnv):
+    """N :class:`~progpolicy_envs.panda.PandaStackEnv`; see :class:`PandaVectorEnv`."""
+
+    env_class: ClassVar[type[PandaEnv]] = PandaStackEnv
+    variations: ClassVar[VariationSpace] = PandaStackEnv.variations
