@@ -27,7 +27,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 _OK, _RAISED, _BROKEN = "ok", "raised", "broken"
 _SECONDS_TO_CLOSE = 5.0
 #: Who waits looks for the message for so long before it goes to sleep; to be woken takes 0.1 to 0.3 ms.
-_SECONDS_AWAKE = 1e-3
+_SECONDS_AWAKE = 2e-3
 
 EnvFn = Callable[[], gym.Env[Any, Any]]
 VenvFn = Callable[[], VecEnv]

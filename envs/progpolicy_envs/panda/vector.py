@@ -35,6 +35,8 @@ class PandaVectorEnv(DomainVectorEnv):
         "render_modes": ["rgb_array"],
     }
     env_class: ClassVar[type[PandaEnv]]
+    observation_names: ClassVar[tuple[str, ...]] = PandaEnv.observation_names
+    action_names: ClassVar[tuple[str, ...]] = PandaEnv.action_names
 
     def __init__(
         self,
