@@ -6,6 +6,9 @@ Random actions, one environment, one core. A block is a reset, not timed, and 50
 Seconds are of processor time, and in every round each candidate runs its blocks one after the other, so that a busy
 machine slows all of them alike; the table shows medians over the rounds, of the ratios too.
 
+The batch is eight simulations with one object in the batched form, in which training runs them in each process; its
+steps are counted one by one.
+
 The bare physics are the same blocks once more with nothing but the calls that go into the physics, recorded before:
 nearly all of them ``stepSimulation``, then the motor commands, and now and then a finer time step or a body put to
 sleep. The arm and the objects move as with the environment, to the last bit.
@@ -26,7 +29,7 @@ import pybullet
 
 from progpolicy_envs import DOMAINS
 
-STEPS = 50
+STEPS, BATCH = 50, 8
 TASKS = ("PandaReach", "PandaPush", "PandaSlide", "PandaStack")
 MISSING = (
     "panda-gym is not installed, so its columns are empty; it is in the extra `peers`: "
@@ -35,11 +38,12 @@ MISSING = (
 #: What goes into the physics, as opposed to what is read from them.
 PHYSICS_CALLS = ("stepSimulation", "setJointMotorControlArray", "setPhysicsEngineParameter", "changeDynamics")
 Call = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
+AnyEnv = gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]
 #: Runs a block and returns the seconds of its reset and of its steps.
 Block = Callable[[int], tuple[float, float]]
 
 
-def block_runner(env: gym.Env[Any, Any]) -> Block:
+def block_runner(env: AnyEnv) -> Block:
     """Return a runner of seeded blocks with random actions."""
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(STEPS)]
@@ -68,9 +72,15 @@ def made(env_id: str, **arguments: Any) -> gym.Env[Any, Any]:
         return gym.make(env_id, disable_env_checker=True, **arguments)
 
 
-def physics_runner(env: gym.Env[Any, Any]) -> Block:
+def batch(task: str) -> gym.vector.VectorEnv[Any, Any, Any]:
+    """Return several of our environments with one object each in their batched form."""
+    return gym.make_vec(f"{task}-v0", num_envs=BATCH, vectorization_mode="vector_entry_point")
+
+
+def physics_runner(env: AnyEnv) -> Block:
     """Return a runner of the same blocks as :func:`block_runner`'s in which only the physics are computed."""
-    world, run = env.unwrapped.scene, block_runner(env)  # type: ignore[attr-defined]
+    worlds = [single.scene for single in getattr(env.unwrapped, "envs", [env.unwrapped])]
+    run = block_runner(env)
     calls: dict[int, list[Call]] = {}
     ends: dict[int, Any] = {}
 
@@ -78,21 +88,22 @@ def physics_runner(env: gym.Env[Any, Any]) -> Block:
         if seed not in calls:
             recorded, in_reset = record(env, seed, run)
             calls[seed] = recorded[in_reset:]
-            ends[seed] = world.robot.position, world.positions
+            ends[seed] = [(world.robot.position, world.positions) for world in worlds]
         env.reset(seed=seed)
         start = time.process_time()
         for function, args, kwargs in calls[seed]:
             function(*args, **kwargs)
         seconds = time.process_time() - start
-        world.read()
-        if (world.robot.position, world.positions) != ends[seed]:
+        for world in worlds:
+            world.read()
+        if [(world.robot.position, world.positions) for world in worlds] != ends[seed]:
             raise RuntimeError(f"the bare physics went another way than {env} from seed {seed}")
         return 0.0, seconds
 
     return replay
 
 
-def record(env: gym.Env[Any, Any], seed: int, run: Block) -> tuple[list[Call], int]:
+def record(env: AnyEnv, seed: int, run: Block) -> tuple[list[Call], int]:
     """Run a block; return the calls that went into the physics, and how many of them the reset made."""
     calls: list[Call] = []
     functions = {name: getattr(pybullet, name) for name in PHYSICS_CALLS}
@@ -148,15 +159,17 @@ def table_row(task: str, blocks: int, rounds: int) -> str:
     """Measure a task and return its row."""
     one, other = ours(task, 1), made(f"{task}-v3") if panda_gym_is_installed() else None
     runners = {"one": block_runner(one), "physics": physics_runner(one), "eight": block_runner(ours(task, 8))}
+    several = batch(task)
+    runners |= {"batch": block_runner(several), "physics of batch": physics_runner(several)}
     if other is not None:
         runners["equal"] = block_runner(ours(task, 2)) if task == "PandaStack" else runners["one"]
         runners["peer"] = block_runner(other)
     measured = measure(runners, blocks, rounds)
     rate = {name: 1 / median(step for _, step in values) for name, values in measured.items()}
     resets = [1000 * median(reset for reset, _ in measured[name]) for name in ("one", "eight")]
-    share = ratio(measured["physics"], measured["one"])
     row = f"{task:<12}{rate['one']:>8,.0f}{rate['eight']:>8,.0f}{ratio(measured['eight'], measured['one']):>8.2f}"
-    row += f"{rate['physics']:>10,.0f}{share:>8.0%}"
+    row += f"{rate['physics']:>10,.0f}{ratio(measured['physics'], measured['one']):>8.0%}"
+    row += f"{BATCH * rate['batch']:>8,.0f}{ratio(measured['physics of batch'], measured['batch']):>8.0%}"
     if other is None:
         row += f"{'-':>11}{'-':>8}"
     else:
@@ -172,8 +185,8 @@ def main() -> None:
     options = parser.parse_args()
     rows = [table_row(task, options.blocks, options.rounds) for task in TASKS]
     print(f"steps/s, median of {options.rounds} interleaved rounds of {options.blocks} x {STEPS} steps\n")
-    print(f"{'':<12}{'1 object':>8}{'8':>8}{'cost':>8}{'physics':>10}{'share':>8}{'panda-gym':>11}{'ratio':>8}", end="")
-    print(f"{'reset, ms':>11}{'8':>8}")
+    print(f"{'':<12}{'1 object':>8}{'8':>8}{'cost':>8}{'physics':>10}{'share':>8}{'batch':>8}{'share':>8}", end="")
+    print(f"{'panda-gym':>11}{'ratio':>8}{'reset, ms':>11}{'8':>8}")
     print(*rows, sep="\n")
     print("\ncost: a step with 8 objects against one with 1; share: of a step's time that is bare physics;")
     print("ratio: our steps/s against panda-gym's; reset: with 1 object and with 8")
