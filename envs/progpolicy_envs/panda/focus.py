@@ -69,6 +69,6 @@ def focus_observation(robot: PandaRobot, state: ObjectState, target: Point, n_le
         *(x, y, z),
         *(tx, ty, tz),
     )
-    if max(features) > BOUND or min(features) < -BOUND:
+    if math.hypot(*features) > BOUND:  # one call; no number is larger than the length of all together
         features = tuple(max(-BOUND, min(BOUND, number)) for number in features)
     return np.array(features, dtype=np.float32)

@@ -144,6 +144,7 @@ class Scene:
         self._still_steps = [0] * MAX_OBJECTS
         #: Centres of the objects in use.
         self.positions: list[Point] = []
+        self._used: list[int] = []
         self.place([])
 
     def _build(self, visual: bool) -> None:
@@ -233,6 +234,7 @@ class Scene:
         self._set_delicate(False)
         self.robot.place()
         self.n_objects = len(positions)
+        self._used = self.objects[: self.n_objects]
         self._still_steps = [0] * MAX_OBJECTS
         for index, body in enumerate(self.objects):
             used = index < self.n_objects
@@ -297,19 +299,21 @@ class Scene:
 
         :param before: the objects' centres one control step ago
         """
-        for index, (old, new) in enumerate(zip(before, self.positions, strict=True)):
-            if math.dist(old, new) > STILL_MOTION:
-                self._still_steps[index] = 0
+        still, positions = self._still_steps, self.positions
+        for index, old in enumerate(before):
+            new = positions[index]
+            if old != new and math.dist(old, new) > STILL_MOTION:
+                still[index] = 0
             else:
-                self._still_steps[index] += 1
-                if self._still_steps[index] == STILL_STEPS:
+                still[index] += 1
+                if still[index] == STILL_STEPS:
                     self._activate(self.objects[index], pybullet.ACTIVATION_STATE_SLEEP)
 
     def read(self) -> None:
         """Take over the state of the robot and the positions of all objects in use; simulate as finely as they need."""
         self.robot.read()
         read, client = pybullet.getBasePositionAndOrientation, self.client
-        self._poses = [read(body, client) for body in self.objects[: self.n_objects]]
+        self._poses = [read(body, client) for body in self._used]
         self.positions = [pose[0] for pose in self._poses]
         delicate = self._is_delicate()
         if delicate != self._delicate:

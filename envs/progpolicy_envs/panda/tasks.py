@@ -64,7 +64,10 @@ class Task(ABC):
     @property
     def failed(self) -> bool:
         """Whether an object has left the table."""
-        return min([position[2] for position in self.positions]) < -FALL_DEPTH
+        for position in self.positions:  # noqa: SIM110 - a generator costs more in what every step does
+            if position[2] < -FALL_DEPTH:
+                return True
+        return False
 
     def settled(self, scene: Scene, index: int) -> bool:
         """Return whether an object, if it is at its target, is finished as far as all else is concerned."""
@@ -216,9 +219,10 @@ class Slide(Task):
         """Take over the state of the world and take delivered pucks off the table."""
         before = self.finished
         super().update(scene)
-        for index, (old, new) in enumerate(zip(before, self.finished, strict=True)):
-            if new and not old:
-                scene.park(index)
+        if self.finished != before:
+            for index, (old, new) in enumerate(zip(before, self.finished, strict=True)):
+                if new and not old:
+                    scene.park(index)
 
     def handle(self, index: int) -> Point:
         """Return the point behind the puck on the line to its target."""
@@ -226,13 +230,14 @@ class Slide(Task):
 
     def _positions(self, scene: Scene) -> list[Point]:
         # A delivered puck keeps the place where it was delivered, although it is off the table.
-        if not any(self.finished):
+        if True not in self.finished:
             return scene.positions
         places = zip(self.finished, self.positions, scene.positions, strict=True)
         return [old if finished else new for finished, old, new in places]
 
     def _finished(self, scene: Scene) -> list[bool]:
-        return [old or new for old, new in zip(self.finished, super()._finished(scene), strict=True)]
+        there = super()._finished(scene)
+        return [old or new for old, new in zip(self.finished, there, strict=True)] if True in self.finished else there
 
 
 class Stack(Task):
@@ -291,7 +296,10 @@ class Stack(Task):
         return free and math.dist(self.positions[index], self._before[index]) < self.rest_motion
 
     def _finished(self, scene: Scene) -> list[bool]:
-        return [there and self.settled(scene, index) for index, there in enumerate(super()._finished(scene))]
+        there = super()._finished(scene)
+        if True not in there:
+            return there
+        return [near and self.settled(scene, index) for index, near in enumerate(there)]
 
 
 def _on_table(starts: Points, targets: Points, height: float) -> tuple[Points, Points]:
