@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 
+import imageio_ffmpeg
 import pytest
 import yaml
 from PIL import Image
@@ -131,6 +132,17 @@ def test_render_writes_a_picture_for_every_step(arguments, frames, program, tmp_
         assert image.size == (480, 240)
 
 
+def test_render_writes_a_film(tmp_path):
+    film = tmp_path / "hanoi.mp4"
+    assert run(["render", "Hanoi-v0", "--planner", "--set", "n_discs=3", "--fps", "4", "-o", str(film)]) == 0
+    frames = imageio_ffmpeg.read_frames(str(film))
+    about = next(frames)
+    assert (about["size"], about["fps"]) == ((480, 240), 4)
+    # The start, a picture for each of seven moves, and the last one for two seconds more.
+    assert len(list(frames)) == 1 + 7 + 2 * 4
+    assert list(tmp_path.iterdir()) == [film]
+
+
 def test_envs_lists_parameters_and_variations(capsys):
     assert run(["envs"]) == 0
     out = capsys.readouterr().out
@@ -159,7 +171,7 @@ def test_envs_lists_parameters_and_variations(capsys):
         (["evaluate", "PROGRAM", "--set", "n_discs=8-1"], "range"),
         (["evaluate", "PROGRAM", "--semantics", "sof"], "nearest: soft"),
         (["show", "PROGRAM", "--format", "lattex"], "nearest: latex"),
-        (["render", "PROGRAM", "-o", "hanoi.mp4"], ".gif"),
+        (["render", "PROGRAM", "-o", "hanoi.avi"], ".mp4"),
         (["show", "PROGRAM", "-o", "nowhere/program.txt"], "nowhere"),
         (["render", "PROGRAM", "--set", "n_discs=1,2", "-o", "hanoi.gif"], "2 variations"),
         (["render", "PROGRAM", "-o", "nowhere/hanoi.gif", "--set", "n_discs=1"], "nowhere"),

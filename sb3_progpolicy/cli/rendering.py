@@ -1,8 +1,9 @@
-"""``progpolicy render``: an episode as an animated GIF."""
+"""``progpolicy render``: an episode as an animated GIF or an MP4 film."""
 
 from __future__ import annotations
 
 import io
+import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,7 +23,7 @@ def render(
         str,
         typer.Argument(help="run folder, program, model or pretrained name; with --planner or --random also an id"),
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="file to write, .gif")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="file to write, .gif or .mp4")],
     variation: Annotated[list[str] | None, typer.Option("--set", help="the variation: n_discs=7")] = None,
     planner: Annotated[bool, typer.Option("--planner", help="the domain's planner acts")] = False,
     random: Annotated[bool, typer.Option("--random", help="actions are drawn at random")] = False,
@@ -31,9 +32,9 @@ def render(
     fps: Annotated[int | None, typer.Option("--fps", min=1, max=50, help="frames per second")] = None,
     max_steps: Annotated[int | None, typer.Option("--max-steps", min=1, help="cap of the episode")] = None,
 ) -> None:
-    """Play one episode and write it as an animated GIF."""
-    if output.suffix.lower() != ".gif":
-        raise ValueError(f"-o {str(output)!r} is not accepted; the file is a .gif")
+    """Play one episode and write it as an animated GIF or an MP4 film."""
+    if output.suffix.lower() not in _FORMATS:
+        raise ValueError(f"-o {str(output)!r} is not accepted; the file is a .gif or an .mp4")
     check_folder(output)
     if planner and random:
         raise ValueError("--planner and --random are not accepted together")
@@ -73,12 +74,12 @@ def _render(
         observation, info = env.reset(seed=seed, options=variations[0])
         env.action_space.seed(seed)
         act = _planner(env) if planner else _random(env) if random else _policy(source, semantics)
-        animation, success = _play(env, act, observation, info.get("optimal_steps"), cap)
-        rate = fps or env.metadata.get("render_fps", 4)
+        frames = _FORMATS[output.suffix.lower()](fps or env.metadata.get("render_fps", 4))
+        steps, success = _play(env, act, observation, info.get("optimal_steps"), cap, frames.add)
     finally:
         env.close()
-    write_atomically(output, animation.gif(rate))
-    return len(animation.frames) - 1, success
+    write_atomically(output, frames.content())
+    return steps, success
 
 
 def _environment_of(name: str) -> Source:
@@ -143,45 +144,92 @@ def _planned_actions(env: Any) -> Iterable[int]:
     raise ValueError(f"--planner is not accepted for {env.spec.id}; it is for {', '.join(DOMAINS)}")
 
 
-def _play(env: Any, act: Act, observation: Any, optimal: int | None, cap: int) -> tuple[_Animation, bool]:
+def _play(
+    env: Any, act: Act, observation: Any, optimal: int | None, cap: int, show: Callable[[Any], None]
+) -> tuple[int, bool]:
     from rich.console import Console
     from rich.progress import Progress
 
-    animation, reward, done, info = _Animation(env.render()), 0.0, False, dict[str, Any]()
+    reward, done, info, steps = 0.0, False, dict[str, Any](), 0
+    show(env.render())
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("playing", total=optimal or cap)
         while not done:
             observation, reward, terminated, truncated, info = env.step(act(observation, reward, done))
             done = terminated or truncated
-            animation.add(env.render())
+            steps += 1
+            show(env.render())
             progress.advance(task)
-    return animation, bool(info.get("is_success", False))
+    return steps, bool(info.get("is_success", False))
 
 
-class _Animation:
+class _Gif:
     """Pictures in one palette, so that colours do not flicker and unchanged pixels cost nothing.
 
-    :param frame: the first picture, ``(height, width, 3)`` bytes
+    :param fps: frames per second
     """
 
-    def __init__(self, frame: Any) -> None:
+    def __init__(self, fps: int) -> None:
         try:
             from PIL import Image
         except ImportError:
-            raise ValueError('render needs Pillow: pip install "sb3-progpolicy[render]"') from None
-        self._image = Image
-        # The default method gives a small thing, such as a plate, the colour of a larger one that looks like it.
-        self.frames = [Image.fromarray(frame).quantize(256, Image.Quantize.MAXCOVERAGE)]
+            raise ValueError('render needs Pillow for a .gif: pip install "sb3-progpolicy[render]"') from None
+        self._image, self._fps = Image, fps
+        self._frames: list[Any] = []
 
     def add(self, frame: Any) -> None:
+        """Add a picture, ``(height, width, 3)`` bytes; the first one gives the palette."""
         image = self._image.fromarray(frame)
-        self.frames.append(image.quantize(palette=self.frames[0], dither=self._image.Dither.NONE))
+        if self._frames:
+            self._frames.append(image.quantize(palette=self._frames[0], dither=self._image.Dither.NONE))
+        else:
+            # The default method gives a small thing, such as a plate, the colour of a larger one that looks like it.
+            self._frames.append(image.quantize(256, self._image.Quantize.MAXCOVERAGE))
 
-    def gif(self, fps: int) -> bytes:
-        durations = [1000 // fps] * (len(self.frames) - 1) + [int(1000 * LAST_FRAME_SECONDS)]
+    def content(self) -> bytes:
+        """Return the file's content."""
+        durations = [1000 // self._fps] * (len(self._frames) - 1) + [int(1000 * LAST_FRAME_SECONDS)]
         buffer = io.BytesIO()
-        self.frames[0].save(
-            buffer, format="GIF", save_all=True, append_images=self.frames[1:], duration=durations, loop=0
-        )
+        first, *others = self._frames
+        first.save(buffer, format="GIF", save_all=True, append_images=others, duration=durations, loop=0)
         return buffer.getvalue()
+
+
+class _Mp4:
+    """A film, encoded while it is made; ffmpeg comes with the package ``imageio-ffmpeg``.
+
+    :param fps: frames per second
+    """
+
+    def __init__(self, fps: int) -> None:
+        try:
+            import imageio_ffmpeg
+        except ImportError:
+            raise ValueError('render needs imageio-ffmpeg for an .mp4: pip install "sb3-progpolicy[video]"') from None
+        self._ffmpeg, self._fps = imageio_ffmpeg, fps
+        self._folder = tempfile.TemporaryDirectory()
+        self._path = Path(self._folder.name, "film.mp4")
+        self._encoder: Any = None
+        self._last: Any = None
+
+    def add(self, frame: Any) -> None:
+        """Add a picture, ``(height, width, 3)`` bytes."""
+        if self._encoder is None:
+            size = frame.shape[1::-1]
+            self._encoder = self._ffmpeg.write_frames(str(self._path), size, fps=self._fps, macro_block_size=2)
+            self._encoder.send(None)
+        self._last = frame
+        self._encoder.send(frame.tobytes())
+
+    def content(self) -> bytes:
+        """Return the file's content."""
+        for _ in range(int(self._fps * LAST_FRAME_SECONDS)):
+            self._encoder.send(self._last.tobytes())
+        self._encoder.close()
+        content = self._path.read_bytes()
+        self._folder.cleanup()
+        return content
+
+
+_FORMATS: dict[str, type[_Gif] | type[_Mp4]] = {".gif": _Gif, ".mp4": _Mp4}
