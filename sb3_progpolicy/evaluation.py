@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from progpolicy_envs import DOMAINS
 from sb3_progpolicy.interaction import VecInteractionHistory, action_spec, interaction_space
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.programs.interpreter import ProgramRunner, Semantics, join_inputs
@@ -170,7 +171,10 @@ def _evaluate(
     if cap is None or cap < 1:
         raise ValueError(f"max_steps={max_steps} is not accepted; {env_id} needs a cap on steps of at least 1")
     rows: list[Evaluation] = []
-    for group in _groups(variations, batched=spec.vector_entry_point is not None):
+    domain = DOMAINS.get(env_id.rpartition(":")[2])
+    # In a batch those that have finished go on until the last has, which is dear where a step is a simulation.
+    batched = spec.vector_entry_point is not None and not (domain is not None and domain.simulation)
+    for group in _groups(variations, batched):
         first = len(rows)
         venv = prepare(make_fast_vec_env(env_id, len(group), max_episode_steps=cap, **(env_kwargs or {})))
         try:

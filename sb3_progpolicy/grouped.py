@@ -7,10 +7,11 @@ import multiprocessing
 import os
 import pickle
 import signal
+import struct
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import accumulate, pairwise
 from multiprocessing.connection import Connection
@@ -24,6 +25,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
+#: Stands before every message: the number of the call.
+_NUMBER = struct.Struct("Q")
 _OK, _RAISED, _BROKEN = "ok", "raised", "broken"
 _SECONDS_TO_CLOSE = 5.0
 #: Who waits looks for the message for so long before it goes to sleep; to be woken takes 0.1 to 0.3 ms.
@@ -31,6 +34,8 @@ _SECONDS_AWAKE = 2e-3
 
 EnvFn = Callable[[], gym.Env[Any, Any]]
 VenvFn = Callable[[], VecEnv]
+#: Name, arguments and keyword arguments of a method of :class:`_Group`.
+Call = tuple[str, tuple[Any, ...], dict[str, Any]]
 
 
 class RemoteTraceback(Exception):
@@ -62,12 +67,12 @@ class GroupedVecEnv(VecEnv):
             raise ValueError("venv_fns=[] is not accepted; at least one is needed")
         self._closed = False
         self._shares: list[range] = []
-        self._owing: list[int] = []
+        self._asked: list[int] = []
         self._parties: list[_Here | _Worker] = []
         try:
             # More processes than cores leave none free for looking whether a message has come.
-            self._start(venv_fns, watchful=len(venv_fns) <= (os.cpu_count() or 1))
-            (first, *_), sizes = zip(*self._ask_all("start", [()] * len(venv_fns)), strict=True)
+            self._start(venv_fns, watchful=len(venv_fns) <= usable_cores())
+            (first, *_), sizes, self._plain_infos = zip(*self._ask_all("start", [()] * len(venv_fns)), strict=True)
             observation_space, action_space, metadata = first
             bounds = [0, *accumulate(sizes)]
             self._shares = [range(*pair) for pair in pairwise(bounds)]
@@ -106,17 +111,20 @@ class GroupedVecEnv(VecEnv):
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Send every worker the actions of its environments."""
-        self._collect(discard=True)
-        for party, share in enumerate(self._shares):
-            self._send(party, "step", (actions[share.start : share.stop],))
+        self._ask(
+            {party: ("step", (actions[share.start : share.stop],), {}) for party, share in enumerate(self._shares)}
+        )
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step the environments of this process and wait for the workers."""
-        observations, rewards, dones, sent_infos, sent_reset_infos = zip(*self._collect(), strict=True)
-        infos: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in range(self.num_envs)]
-        for share, some, resets in zip(self._shares, sent_infos, sent_reset_infos, strict=True):
-            for row, info in some.items():
-                infos[share.start + row] = info
+        if len(self._asked) < len(self._parties):
+            raise RuntimeError("there is no step to wait for: step_async was not called, or another call came after it")
+        observations, rewards, dones, sent_infos, sent_reset_infos = zip(*self._answers(), strict=True)
+        infos: list[dict[str, Any]] = []
+        for share, plain, some, resets in zip(
+            self._shares, self._plain_infos, sent_infos, sent_reset_infos, strict=True
+        ):
+            infos += [some.get(row, dict(plain)) for row in range(len(share))]
             for row, info in resets.items():
                 self.reset_infos[share.start + row] = info
         return _joined(observations), np.concatenate(rewards), np.concatenate(dones), infos
@@ -126,10 +134,12 @@ class GroupedVecEnv(VecEnv):
         if self._closed:
             return
         self._closed = True
-        for party in reversed(self._parties):  # the workers, before this process is busy with its own environments
-            party.close()
-        for party in self._parties:
-            party.join()
+        try:
+            for party in reversed(self._parties):  # the workers, before this process is busy with its own environments
+                party.close()
+        finally:
+            for party in self._parties:
+                party.join()
 
     def get_images(self) -> Sequence[NDArray[Any] | None]:
         """Return one picture per environment, ``None`` where the render mode is not ``"rgb_array"``."""
@@ -163,49 +173,46 @@ class GroupedVecEnv(VecEnv):
 
     def _in_order(self, method: str, rows: Sequence[int], *args: Any, per_row: bool = True, **kwargs: Any) -> list[Any]:
         """Call a method of the parts, return its results in the order of ``rows``."""
-        self._collect(discard=True)
+        calls: dict[int, Call] = {}
         asked: list[list[int]] = []
         for party, share in enumerate(self._shares):
             mine = [row for row in rows if row in share]
             if mine:
                 asked.append(mine)
                 indices = {"indices": [row - share.start for row in mine]} if per_row else {}
-                self._send(party, method, args, {**kwargs, **indices})
-        answers = self._collect()
+                calls[party] = method, args, {**kwargs, **indices}
+        self._ask(calls)
+        answers = self._answers()
         # A row asked for twice has its results in the order in which they were asked for.
         results = [iter(answer or [None] * len(mine)) for answer, mine in zip(answers, asked, strict=True)]
         owner = {row: result for mine, result in zip(asked, results, strict=True) for row in mine}
         return [next(owner[row]) for row in rows]
 
     def _ask_all(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
-        self._collect(discard=True)
-        for party, args in enumerate(arguments):
-            self._send(party, method, args)
-        return self._collect()
+        self._ask({party: (method, args, {}) for party, args in enumerate(arguments)})
+        return self._answers()
 
-    def _send(self, party: int, method: str, args: tuple[Any, ...], kwargs: dict[str, Any] | None = None) -> None:
+    def _ask(self, calls: Mapping[int, Call]) -> None:
+        """Send each part its call; the answers to earlier calls that nobody waited for are dropped."""
         if self._closed:
             raise RuntimeError("the environments are closed; make new ones")
-        try:
-            self._parties[party].send(method, args, kwargs or {})
-        except OSError:
-            raise self._death(party) from None
-        self._owing.append(party)
-
-    def _collect(self, discard: bool = False) -> list[Any]:
-        """Receive the answers that are owed; raise the first error among them when all are in.
-
-        :param discard: they are those of a call that was interrupted, and are dropped
-        """
-        answers = []
-        while self._owing:
+        self._asked = []
+        for party, call in calls.items():
             try:
-                answers.append(self._parties[self._owing[0]].receive())
+                self._parties[party].send(*call)
+            except OSError:
+                raise self._death(party) from None
+        self._asked = list(calls)
+
+    def _answers(self) -> list[Any]:
+        """Receive the answers to the last calls; raise the first error among them when all are in."""
+        asked, self._asked = self._asked, []
+        answers = []
+        for party in asked:
+            try:
+                answers.append(self._parties[party].receive())
             except (EOFError, OSError):
-                raise self._death(self._owing[0]) from None
-            self._owing.pop(0)
-        if discard:
-            return []
+                raise self._death(party) from None
         for kind, value in answers:
             if kind == _RAISED:
                 error, text = value
@@ -219,7 +226,6 @@ class GroupedVecEnv(VecEnv):
         worker = self._parties[party]
         assert isinstance(worker, _Worker)
         worker.process.join(_SECONDS_TO_CLOSE)
-        self._owing.clear()
         self.close()
         share = self._shares[party] if self._shares else None
         what = f"which ran environments {share.start} to {share.stop - 1}, " if share else ""
@@ -248,9 +254,14 @@ class GroupedSubprocVecEnv(GroupedVecEnv):
             raise ValueError("env_fns=[] is not accepted; at least one environment is needed")
         if n_workers is not None and n_workers < 1:
             raise ValueError(f"n_workers={n_workers} is not accepted; it is at least 1")
-        n_shares = 1 + (n_workers or max(1, (os.cpu_count() or 1) - 1))
+        n_shares = 1 + (n_workers or max(1, usable_cores() - 1))
         shares = even_shares(len(env_fns), n_shares)
         super().__init__([partial(DummyVecEnv, list(env_fns[share.start : share.stop])) for share in shares])
+
+
+def usable_cores() -> int:
+    """Return how many cores this process may use, which may be fewer than there are."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def even_shares(n_envs: int, n_shares: int) -> list[range]:
@@ -272,16 +283,17 @@ class _Here:
     def __init__(self, venv_fn: VenvFn) -> None:
         self._venv_fn = venv_fn
         self._group: _Group | None = None
-        self._asked: tuple[str, tuple[Any, ...], dict[str, Any]] | None = None
+        self._asked: Call | None = None
 
     def send(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-        """Take note of a call."""
+        """Take note of a call; one that nobody waited for is made now, as a worker has made it too."""
+        if self._asked is not None:
+            self.receive()
         self._asked = method, args, kwargs
 
     def receive(self) -> tuple[str, Any]:
         """Make the call and return its result or error; an interrupted call is not made again."""
-        if self._asked is None:
-            return _OK, None
+        assert self._asked is not None
         (method, args, kwargs), self._asked = self._asked, None
         try:
             if self._group is None:
@@ -302,6 +314,9 @@ class _Here:
 class _Worker:
     """A process with one part, and the connection to it.
 
+    Calls and answers carry the number of the call. Whatever an interrupt leaves in the connection is recognised by
+    that, and an answer is taken out of the connection whole before it is unpickled.
+
     :param context: of multiprocessing
     :param number: of the worker
     :param venv_fn: makes the part
@@ -310,6 +325,7 @@ class _Worker:
 
     def __init__(self, context: Any, number: int, venv_fn: VenvFn, seconds_awake: float) -> None:
         self.number, self._seconds_awake = number, seconds_awake
+        self._n_calls = self._n_answered = 0
         self._remote, remote_of_worker = context.Pipe()
         self.process = context.Process(
             target=_work,
@@ -323,19 +339,37 @@ class _Worker:
 
     def send(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         """Send a call."""
+        # An answer that nobody waited for might fill the connection while this message does too. There is none if the
+        # interrupt came before its call was sent, so the wait has an end.
+        while self._n_answered < self._n_calls and self._remote.poll(_SECONDS_TO_CLOSE):
+            self._take()
         # Actions are an array, for which pickle is several times faster; other arguments may come from the main script.
         dumps = pickle.dumps if method == "step" else cloudpickle.dumps
-        self._remote.send_bytes(dumps((method, args, kwargs)))
+        message = dumps((method, args, kwargs))
+        self._n_calls += 1
+        self._remote.send_bytes(_NUMBER.pack(self._n_calls) + message)
 
-    def receive(self) -> Any:
-        """Wait for the answer to a call."""
+    def receive(self) -> tuple[str, Any]:
+        """Wait for the answer to the last call."""
         _watch(self._remote, self._seconds_awake)
-        return self._remote.recv()
+        message = self._take()
+        while self._n_answered < self._n_calls:
+            message = self._take()
+        try:
+            kind, value = pickle.loads(message[_NUMBER.size :])
+        except Exception:
+            return _BROKEN, f"its answer cannot be unpickled\n{traceback.format_exc()}"
+        return kind, value
+
+    def _take(self) -> bytes:
+        message = self._remote.recv_bytes()
+        self._n_answered = _NUMBER.unpack_from(message)[0]
+        return message
 
     def close(self) -> None:
         """Ask the process to end."""
         with contextlib.suppress(OSError):
-            self._remote.send_bytes(cloudpickle.dumps(("close", (), {})))
+            self._remote.send_bytes(_NUMBER.pack(self._n_calls + 1) + pickle.dumps(("close", (), {})))
         # A worker that is still sending an answer is freed by this; nobody will read it.
         self._remote.close()
 
@@ -362,23 +396,27 @@ class _Group:
 
     def __init__(self, venv: VecEnv) -> None:
         self.venv = venv
+        # DummyVecEnv puts this into every info; alone it says nothing.
+        self.plain_info = {"TimeLimit.truncated": False} if isinstance(venv.unwrapped, DummyVecEnv) else {}
 
-    def start(self) -> tuple[tuple[Any, Any, Any], int]:
+    def start(self) -> tuple[tuple[Any, Any, Any], int, dict[str, Any]]:
         """Return what the main process has to know."""
-        venv = self.venv
-        return (venv.observation_space, venv.action_space, getattr(venv, "metadata", {})), venv.num_envs
+        spaces_and_metadata = self.venv.observation_space, self.venv.action_space, getattr(self.venv, "metadata", {})
+        return spaces_and_metadata, self.venv.num_envs, self.plain_info
 
     def reset(self, seeds: list[int | None], options: list[dict[str, Any]]) -> tuple[VecEnvObs, list[dict[str, Any]]]:
         """Reset with seeds and options, one for each environment."""
-        self.venv._seeds, self.venv._options = seeds, options
-        return self.venv.reset(), self.venv.reset_infos
+        # Wrappers have these attributes too, and do not look at them.
+        inner = self.venv.unwrapped
+        inner._seeds, inner._options = seeds, options
+        return self.venv.reset(), inner.reset_infos
 
     def step(self, actions: NDArray[Any]) -> tuple[Any, ...]:
         """Step; return infos and reset infos by row, only where they say something new."""
         observations, rewards, dones, infos = self.venv.step(actions)
-        # DummyVecEnv puts "TimeLimit.truncated" into every info; alone and False it says nothing.
-        some = {row: info for row, info in enumerate(infos) if len(info) > 1 or info.get("TimeLimit.truncated")}
-        resets = {row: self.venv.reset_infos[row] for row in np.flatnonzero(dones).tolist()}
+        plain = self.plain_info
+        some = {row: info for row, info in enumerate(infos) if len(info) > len(plain) or info != plain}
+        resets = {row: self.venv.unwrapped.reset_infos[row] for row in np.flatnonzero(dones).tolist()}
         return observations, rewards, dones, some, resets
 
     def has_attr(self, name: str) -> bool:
@@ -402,8 +440,9 @@ def _work(remote: Connection, pickled_venv_fn: bytes, seconds_awake: float) -> N
         while True:
             _watch(remote, seconds_awake)
             message = remote.recv_bytes()
+            number = message[: _NUMBER.size]
             try:
-                method, args, kwargs = cloudpickle.loads(message)
+                method, args, kwargs = pickle.loads(message[_NUMBER.size :])
                 if method == "close":
                     break
                 if group is None:
@@ -413,7 +452,7 @@ def _work(remote: Connection, pickled_venv_fn: bytes, seconds_awake: float) -> N
                 answer = _pickled((_OK, getattr(group, method)(*args, **kwargs)))
             except Exception as error:
                 answer = _pickled_error(error)
-            remote.send_bytes(answer)
+            remote.send_bytes(number + answer)
     if group is not None:
         group.venv.close()
     remote.close()

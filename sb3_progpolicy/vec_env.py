@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Mapping, Sequence
+import multiprocessing
+from collections.abc import Mapping, Sequence
 from functools import partial
 from importlib import import_module
 from typing import Any
@@ -17,15 +17,15 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from progpolicy_envs import DOMAINS
-from sb3_progpolicy.grouped import GroupedSubprocVecEnv, GroupedVecEnv, even_shares
+from sb3_progpolicy.grouped import GroupedSubprocVecEnv, GroupedVecEnv, even_shares, usable_cores
 
 
 class BatchedVecEnv(VecEnv):
     """A Gymnasium ``VectorEnv`` that resets within the step, as an SB3 ``VecEnv``.
 
     Attributes and methods reached through ``get_attr``, ``set_attr`` and ``env_method`` are the batch's own, the same
-    for every environment. A variation is set by ``set_options(variation)`` and the next ``reset``, one for all
-    environments, or a list with one for each.
+    for every environment of it, whatever indices are given. A variation is set by ``set_options(variation)`` and the
+    next ``reset``, one for all environments, or a list with one for each. Infos are given where an episode ends.
 
     :param env: a vector environment whose autoreset mode is ``SAME_STEP``
     :raises ValueError: for another autoreset mode
@@ -44,11 +44,14 @@ class BatchedVecEnv(VecEnv):
         """Reset every environment, with the seeds and options given since the last reset."""
         seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
         names = {name for options in self._options for name in options}
-        if any(set(options) != names for options in self._options):
+        # What an option is not given for keeps the value in force, which a batch has to be told.
+        in_force = getattr(self.env, "row_variations", [{}] * self.num_envs)
+        rows = [{**old, **new} for old, new in zip(in_force, self._options, strict=True)]
+        if any(not names <= set(row) for row in rows):
             raise ValueError(f"every environment needs the same option names; given: {self._options}")
-        options = {name: [row[name] for row in self._options] for name in sorted(names)}
+        options = {name: [row[name] for row in rows] for name in sorted(names)}
         observations, infos = self.env.reset(seed=seeds, options=options or None)  # type: ignore[arg-type]
-        self.reset_infos = self._per_row(infos)
+        self.reset_infos = [_info_of_row(infos, row) for row in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
         return observations
@@ -64,11 +67,16 @@ class BatchedVecEnv(VecEnv):
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for row in dones.nonzero()[0]:
             infos[row] = {
+                **_info_of_row(batch.get("final_info", batch), row),
                 "terminal_observation": batch["final_obs"][row],
                 "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
-                "is_success": bool(batch["is_success"][row]),
             }
         return observations, rewards.astype(np.float32), dones, infos
+
+    def get_images(self) -> Sequence[NDArray[Any] | None]:
+        """Return one picture per environment, ``None`` without a render mode."""
+        pictures: Any = self.env.render() if self.render_mode else [None] * self.num_envs
+        return list(pictures)
 
     def close(self) -> None:
         """Close the batch."""
@@ -95,24 +103,31 @@ class BatchedVecEnv(VecEnv):
     def _rows(self, indices: VecEnvIndices) -> Sequence[int]:
         return list(self._get_indices(indices))
 
-    def _per_row(self, infos: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:
-        return [dict(zip(infos, row, strict=True)) for row in zip(*infos.values(), strict=True)] or [
-            {} for _ in range(self.num_envs)
-        ]
+
+def _info_of_row(infos: Mapping[str, Any], row: int) -> dict[str, Any]:
+    """Return one environment's info. By Gymnasium's convention ``_name`` tells which environments gave ``name``."""
+    info = {}
+    for name, values in infos.items():
+        given = infos.get(f"_{name}")
+        if name.startswith("_") or name in ("final_obs", "final_info") or (given is not None and not given[row]):
+            continue
+        value = _info_of_row(values, row) if isinstance(values, Mapping) else values[row]
+        info[name] = value.item() if isinstance(value, np.generic) else value
+    return info
 
 
 def make_fast_vec_env(env_id: str, n_envs: int, seed: int | None = None, **env_kwargs: Any) -> VecEnv:
     """Build the fastest vectorised environment of an id, monitored.
 
     The batched form is taken where the id has one that resets within the step; several environments of a domain that
-    is a simulation are batched in as many processes as there are cores. All others run in this process, one after the
-    other, and so do the goal forms of the simulations, in as many processes: a replay buffer needs their infos of every
-    step, which a batch gives only where an episode ends.
+    is a simulation are batched in as many processes as there are cores to use. All others run in this process, one
+    after the other. So do those with a window, and the goal forms of the simulations, these in as many
+    processes: a replay buffer needs their infos of every step, which a batch gives only where an episode ends.
 
     :param env_id: a registered id, with or without a module prefix
     :param n_envs: number of environments, at least 1
     :param seed: environment ``i`` gets ``seed + i``
-    :param env_kwargs: passed to the environment
+    :param env_kwargs: passed to ``gym.make`` or ``gym.make_vec``
     """
     if n_envs < 1:
         raise ValueError(f"n_envs={n_envs} is not accepted; it is at least 1")
@@ -121,9 +136,17 @@ def make_fast_vec_env(env_id: str, n_envs: int, seed: int | None = None, **env_k
         import_module(module)  # registers the id; gym.spec does not know the prefix
     domain = DOMAINS.get(name)
     simulation = domain is not None and domain.simulation
-    n_processes = min(n_envs, os.cpu_count() or 1) if simulation else 1
+    # Such processes as those of a multiprocessing.Pool may not start others.
+    may_start = simulation and not multiprocessing.current_process().daemon
+    n_processes = min(n_envs, usable_cores()) if may_start else 1
+    goal = simulation and env_kwargs.get("observation") == "goal"
+    render_mode = env_kwargs.get("render_mode")
     venv: VecEnv | None = None
-    if gym.spec(name).vector_entry_point is not None and not (simulation and env_kwargs.get("observation") == "goal"):
+    if (
+        gym.spec(name).vector_entry_point is not None
+        and not goal
+        and (render_mode is None or (simulation and render_mode != "human"))
+    ):
         if n_processes > 1:
             shares = even_shares(n_envs, n_processes)
             venv = GroupedVecEnv([partial(_simulations, env_id, len(share), env_kwargs) for share in shares])
@@ -139,7 +162,10 @@ def make_fast_vec_env(env_id: str, n_envs: int, seed: int | None = None, **env_k
 
 def _batch(env_id: str, n_envs: int, env_kwargs: Mapping[str, Any]) -> BatchedVecEnv | None:
     """Return the batched form of an id, ``None`` if it does not reset within the step."""
-    batch = gym.make_vec(env_id, num_envs=n_envs, vectorization_mode="vector_entry_point", **env_kwargs)
+    kwargs = {name: value for name, value in env_kwargs.items() if name != "disable_env_checker"}
+    if kwargs.get("max_episode_steps", 0) is None:  # means the registered number, to gym.make
+        del kwargs["max_episode_steps"]
+    batch = gym.make_vec(env_id, num_envs=n_envs, vectorization_mode="vector_entry_point", **kwargs)
     try:
         return BatchedVecEnv(batch)
     except ValueError:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from copy import deepcopy
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import gymnasium as gym
@@ -14,10 +15,11 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecMonitor
 
+from sb3_progpolicy import grouped as module
 from sb3_progpolicy import vec_env
-from sb3_progpolicy.grouped import GroupedSubprocVecEnv, GroupedVecEnv, RemoteTraceback
+from sb3_progpolicy.grouped import GroupedSubprocVecEnv, GroupedVecEnv, RemoteTraceback, even_shares
 from sb3_progpolicy.vec_env import BatchedVecEnv, make_fast_vec_env
 
 N_ENVS = 5
@@ -66,6 +68,9 @@ class Countdown(gym.Env):
 
     def fail(self):
         raise Locked("a", "b")
+
+    def give_locked(self):
+        return Locked("a", "b")
 
     def name_closing(self, path):
         self.closed_file = path
@@ -148,6 +153,7 @@ def test_attributes_and_methods_reach_the_environments_asked_for(pair, indices):
         env.env_method("set_wrapper_attr", "mark", 5, force=True, indices=indices)
         env.set_attr("note", "seen", indices)
     assert grouped.get_attr("start", indices) == single.get_attr("start", indices)
+    assert grouped.env_method("get_wrapper_attr", "start", indices=indices) == single.get_attr("start", indices)
     chosen = single._get_indices(indices)
     assert grouped.get_attr("note", indices) == ["seen"] * len(list(chosen))
     assert grouped.env_is_wrapped(Marked, indices) == single.env_is_wrapped(Marked, indices)
@@ -192,6 +198,72 @@ def test_an_error_that_cannot_travel_is_told_in_words(pair):
     assert "Locked: a and b" in str(caught.value)
 
 
+def test_an_answer_that_cannot_be_read_is_told_and_the_next_one_is_right(pair):
+    grouped, _ = pair
+    with pytest.raises(RuntimeError, match="cannot be unpickled"):
+        grouped.env_method("give_locked", indices=[4])
+    assert len(grouped.reset()) == N_ENVS
+
+
+@pytest.mark.parametrize("moment", ["before a message", "after a message", "before an answer", "after an answer"])
+def test_an_interrupt_between_messages_does_not_mix_up_answers(pair, monkeypatch, moment):
+    grouped, _ = pair
+    monkeypatch.setattr(module, "_SECONDS_TO_CLOSE", 0.2)
+    grouped.set_options({"start": 4})
+    grouped.reset()
+    name = "send_bytes" if "message" in moment else "recv_bytes"
+    original = getattr(Connection, name)
+
+    def interrupted(connection, *args):
+        if "after" in moment:
+            original(connection, *args)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Connection, name, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        grouped.step(np.zeros(N_ENVS, dtype=int))
+    monkeypatch.setattr(Connection, name, original)
+    assert grouped.get_attr("start") == [4] * N_ENVS
+    assert len(grouped.reset()) == N_ENVS
+    assert grouped.get_attr("left") == [4] * N_ENVS
+
+
+def test_waiting_for_a_step_that_was_not_asked_for_is_refused(pair):
+    grouped, _ = pair
+    grouped.reset()
+    with pytest.raises(RuntimeError, match="step_async was not called"):
+        grouped.step_wait()
+
+
+class OneKey(VecEnvWrapper):
+    """Has infos of one key."""
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        observations, rewards, dones, _ = self.venv.step_wait()
+        return observations, rewards, dones, [{"row": row} if row else {} for row in range(self.num_envs)]
+
+
+def test_parts_of_any_kind_keep_their_infos_seeds_and_options():
+    def part():
+        return OneKey(VecMonitor(DummyVecEnv([Countdown, Countdown])))
+
+    grouped, single = GroupedVecEnv([part, part]), part()
+    try:
+        for env in (grouped, single):
+            env.seed(5)
+            env.set_options([{"start": 3 + row} for row in range(env.num_envs)])
+        alone, together = single.reset(), grouped.reset()
+        np.testing.assert_array_equal(together[:2], alone)
+        assert [info["start"] for info in grouped.reset_infos] == [3, 4, 5, 6]
+        infos = grouped.step(np.zeros(4, dtype=int))[3]
+        assert [{key: info[key] for key in info if key == "row"} for info in infos] == [{}, {"row": 1}] * 2
+    finally:
+        grouped.close()
+
+
 def test_the_answer_to_an_interrupted_step_is_dropped(pair):
     grouped, single = pair
     for env in pair:
@@ -231,6 +303,14 @@ def test_a_worker_that_dies_is_named_and_everything_is_closed():
     with pytest.raises(RuntimeError, match="closed; make new ones"):
         env.reset()
     env.close()
+
+
+def test_workers_are_ended_also_if_closing_fails_here():
+    env = GroupedSubprocVecEnv(functions(), 2)
+    env._parties[0]._group.venv.envs[0].close = lambda: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        env.close()
+    assert [process.is_alive() for process in env.processes] == [False, False]
 
 
 def test_close_closes_the_environments_and_ends_the_workers_also_during_a_step(tmp_path):
@@ -302,13 +382,15 @@ def test_no_more_workers_than_environments_and_even_shares():
     env = GroupedSubprocVecEnv(functions(3), 8)
     assert len(env.processes) == 2
     env.close()
+    assert [list(share) for share in even_shares(5, 3)] == [[0], [1, 2], [3, 4]]
+    assert [list(share) for share in even_shares(2, 3)] == [[0], [1]]
 
 
 @pytest.mark.parametrize(
     ("arguments", "kind"), [({}, GroupedVecEnv), ({"observation": "goal"}, GroupedSubprocVecEnv)], ids=["flat", "goal"]
 )
 def test_simulations_are_grouped_and_equal_single_ones(monkeypatch, arguments, kind):
-    monkeypatch.setattr(vec_env.os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(vec_env, "usable_cores", lambda: 2)
     options = [{"n_targets": n} for n in (1, 2, 3)]
     arguments = {**arguments, "max_episode_steps": 15}
     grouped = make_fast_vec_env("PandaReach-v0", 3, seed=5, **arguments)
@@ -339,7 +421,27 @@ def test_simulations_are_grouped_and_equal_single_ones(monkeypatch, arguments, k
 
 @pytest.mark.parametrize(("env_id", "n_envs", "cores"), [("PandaReach-v0", 1, 8), ("PandaReach-v0", 2, 1)])
 def test_one_simulation_or_one_core_needs_no_process(monkeypatch, env_id, n_envs, cores):
-    monkeypatch.setattr(vec_env.os, "cpu_count", lambda: cores)
+    monkeypatch.setattr(vec_env, "usable_cores", lambda: cores)
     env = make_fast_vec_env(env_id, n_envs)
+    assert isinstance(env.unwrapped, BatchedVecEnv)
+    env.close()
+
+
+@pytest.mark.parametrize("cores", [1, 2])
+def test_simulations_take_some_options_for_some_and_draw_pictures(monkeypatch, cores):
+    monkeypatch.setattr(vec_env, "usable_cores", lambda: cores)
+    env = make_fast_vec_env("PandaReach-v0", 2, render_mode="rgb_array")
+    env.set_options([{"n_targets": 2}, {}])
+    env.reset()
+    assert [info["variation"] for info in env.unwrapped.reset_infos] == [{"n_targets": 2}, {"n_targets": 1}]
+    assert [picture.shape for picture in env.get_images()] == [(360, 480, 3)] * 2
+    assert env.render().shape[2] == 3
+    env.close()
+
+
+def test_no_process_is_started_where_none_may_be(monkeypatch):
+    monkeypatch.setattr(vec_env, "usable_cores", lambda: 2)
+    monkeypatch.setattr(vec_env.multiprocessing.current_process(), "_config", {"daemon": True})
+    env = make_fast_vec_env("PandaReach-v0", 2)
     assert isinstance(env.unwrapped, BatchedVecEnv)
     env.close()

@@ -3,7 +3,8 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import RecordEpisodeStatistics
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, is_vecenv_wrapped
 
@@ -72,13 +73,55 @@ def test_other_autoreset_modes_are_refused():
         BatchedVecEnv(SyncVectorEnv([lambda: gym.make("CartPole-v1")]))
 
 
+def test_other_batches_that_reset_within_the_step_are_taken_as_they_are():
+    batch = gym.make_vec(
+        "CartPole-v1",
+        num_envs=2,
+        vectorization_mode="sync",
+        vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
+        wrappers=[RecordEpisodeStatistics],
+    )
+    batched, single = BatchedVecEnv(batch), make_vec_env("CartPole-v1", 2, seed=1)
+    batched.seed(1)
+    np.testing.assert_array_equal(batched.reset(), single.reset())
+    ends = 0
+    for _ in range(60):
+        a, b = (env.step(np.ones(2, dtype=int)) for env in (batched, single))
+        for one, other in zip(a[:3], b[:3], strict=True):
+            np.testing.assert_array_equal(one, other)
+        for row in np.flatnonzero(a[2]):
+            ends += 1
+            np.testing.assert_array_equal(a[3][row]["terminal_observation"], b[3][row]["terminal_observation"])
+            assert a[3][row]["episode"]["l"] == b[3][row]["episode"]["l"]
+    assert ends > 4
+
+
+def test_limits_on_steps_mean_what_they_do_in_the_single_form():
+    def length(limit):
+        env = make_fast_vec_env("Hanoi-v0", 1, n_discs=8, max_episode_steps=limit)
+        env.reset()
+        return next((step for step in range(1, 700) if env.step(np.zeros(1, dtype=int))[2][0]), None)
+
+    assert (length(7), length(-1), length(None)) == (7, None, 500)
+    with pytest.raises(ValueError, match="max_episode_steps=0"):
+        length(0)
+
+
+def test_pictures_come_from_the_single_form_where_the_batch_draws_none():
+    env = make_fast_vec_env("Hanoi-v0", 2, render_mode="rgb_array")
+    env.reset()
+    assert env.render().ndim == 3
+    env.close()
+
+
 def test_no_environment_is_refused():
     with pytest.raises(ValueError, match="n_envs=0"):
         make_fast_vec_env("Hanoi-v0", 0)
 
 
-def test_different_option_names_for_one_batch_are_refused():
+def test_options_that_only_some_environments_are_given_leave_the_others_as_they_are():
     env = make_fast_vec_env("Hanoi-v0", 2)
     env.set_options([{"n_discs": 1}, {"source": 1}])
-    with pytest.raises(ValueError, match="same option names"):
-        env.reset()
+    env.reset()
+    variations = [info["variation"] for info in env.unwrapped.reset_infos]
+    assert [(variation["n_discs"], variation["source"]) for variation in variations] == [(1, 0), (3, 1)]

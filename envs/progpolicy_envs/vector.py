@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, SupportsIndex
 
 import numpy as np
 from gymnasium.spaces import Space
@@ -28,7 +28,7 @@ class DomainVectorEnv(VectorEnv, ABC):
     :param observation_space: of one environment
     :param action_space: of one environment
     :param variation: the variation in force in every environment
-    :param max_episode_steps: steps after which an episode is truncated; ``None`` for no limit
+    :param max_episode_steps: steps after which an episode is truncated; ``None`` or -1 for no limit
     """
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
@@ -48,7 +48,13 @@ class DomainVectorEnv(VectorEnv, ABC):
         self.single_action_space = action_space
         self.observation_space = batch_space(observation_space, num_envs)
         self.action_space = batch_space(action_space, num_envs)
-        self.max_episode_steps = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
+        if max_episode_steps is None or max_episode_steps == -1:
+            max_episode_steps = np.iinfo(np.int64).max
+        if max_episode_steps < 1:
+            raise ValueError(
+                f"max_episode_steps={max_episode_steps} is not accepted; it is at least 1, or None or -1 for no limit"
+            )
+        self.max_episode_steps = max_episode_steps
         self.row_variations: list[Variation] = [dict(variation) for _ in range(num_envs)]
         self._elapsed = np.zeros(num_envs, dtype=np.int64)
         self._rows = np.arange(num_envs)
@@ -119,7 +125,7 @@ class DomainVectorEnv(VectorEnv, ABC):
     def _seed_rows(self, seed: int | Sequence[int | None] | None) -> None:
         if seed is None:
             return
-        seeds = [seed + row for row in range(self.num_envs)] if isinstance(seed, int) else list(seed)
+        seeds = [seed + row for row in range(self.num_envs)] if isinstance(seed, SupportsIndex) else list(seed)
         if len(seeds) != self.num_envs:
             raise ValueError(f"{len(seeds)} seeds given for {self.num_envs} environments")
         for row, row_seed in enumerate(seeds):

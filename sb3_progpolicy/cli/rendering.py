@@ -74,11 +74,11 @@ def _render(
         observation, info = env.reset(seed=seed, options=variations[0])
         env.action_space.seed(seed)
         act = _planner(env) if planner else _random(env) if random else _policy(source, semantics)
-        frames = _FORMATS[output.suffix.lower()](fps or env.metadata.get("render_fps", 4))
-        steps, success = _play(env, act, observation, info.get("optimal_steps"), cap, frames.add)
+        with _FORMATS[output.suffix.lower()](fps or env.metadata.get("render_fps", 4)) as frames:
+            steps, success = _play(env, act, observation, info.get("optimal_steps"), cap, frames.add)
+            write_atomically(output, frames.content())
     finally:
         env.close()
-    write_atomically(output, frames.content())
     return steps, success
 
 
@@ -178,6 +178,12 @@ class _Gif:
         self._image, self._fps = Image, fps
         self._frames: list[Any] = []
 
+    def __enter__(self) -> _Gif:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._frames.clear()
+
     def add(self, frame: Any) -> None:
         """Add a picture, ``(height, width, 3)`` bytes; the first one gives the palette."""
         image = self._image.fromarray(frame)
@@ -213,6 +219,14 @@ class _Mp4:
         self._encoder: Any = None
         self._last: Any = None
 
+    def __enter__(self) -> _Mp4:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._encoder is not None:
+            self._encoder.close()
+        self._folder.cleanup()
+
     def add(self, frame: Any) -> None:
         """Add a picture, ``(height, width, 3)`` bytes."""
         if self._encoder is None:
@@ -227,9 +241,7 @@ class _Mp4:
         for _ in range(int(self._fps * LAST_FRAME_SECONDS)):
             self._encoder.send(self._last.tobytes())
         self._encoder.close()
-        content = self._path.read_bytes()
-        self._folder.cleanup()
-        return content
+        return self._path.read_bytes()
 
 
 _FORMATS: dict[str, type[_Gif] | type[_Mp4]] = {".gif": _Gif, ".mp4": _Mp4}

@@ -49,9 +49,15 @@ class PandaVectorEnv(DomainVectorEnv):
             raise ValueError(f"render_mode={render_mode!r} is not accepted; a batch has None or 'rgb_array'")
         check_num_envs(num_envs)
         self.render_mode = render_mode
-        self.envs = [self.env_class(render_mode=render_mode, **arguments) for _ in range(num_envs)]
-        first = self.envs[0]
-        super().__init__(num_envs, first.observation_space, first.action_space, first.variation, max_episode_steps)
+        self.envs: list[PandaEnv] = []
+        try:
+            for _ in range(num_envs):
+                self.envs.append(self.env_class(render_mode=render_mode, **arguments))
+            first = self.envs[0]
+            super().__init__(num_envs, first.observation_space, first.action_space, first.variation, max_episode_steps)
+        except BaseException:
+            self.close_extras()
+            raise
         self._observations: list[Observation] = [np.empty(0, np.float32)] * num_envs
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
@@ -64,12 +70,14 @@ class PandaVectorEnv(DomainVectorEnv):
             env.close()
 
     def _checked(self, actions: NDArray[Any]) -> NDArray[Any]:
-        if actions.shape != self.action_space.shape or not np.isfinite(actions).all():
+        with np.errstate(over="ignore"):
+            numbers = actions.astype(np.float32)
+        if actions.shape != self.action_space.shape or not np.isfinite(numbers).all():
             raise ValueError(
                 f"actions of shape {actions.shape} and values {actions!r} are not accepted; "
                 f"needed: shape {self.action_space.shape}, finite numbers from -1 to 1"
             )
-        return actions.astype(np.float32)
+        return numbers
 
     def _apply(self, actions: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.bool_], Infos]:
         for env, numbers in zip(self.envs, actions.tolist(), strict=True):
