@@ -9,6 +9,7 @@ import pickle
 import signal
 import struct
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -314,8 +315,8 @@ class _Here:
 class _Worker:
     """A process with one part, and the connection to it.
 
-    Calls and answers carry the number of the call. Whatever an interrupt leaves in the connection is recognised by
-    that, and an answer is taken out of the connection whole before it is unpickled.
+    Calls and answers are numbered, so that an answer nobody waited for is known as such. An interrupt finds messages
+    sent and taken whole or not at all.
 
     :param context: of multiprocessing
     :param number: of the worker
@@ -339,15 +340,14 @@ class _Worker:
 
     def send(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         """Send a call."""
-        # An answer that nobody waited for might fill the connection while this message does too. There is none if the
-        # interrupt came before its call was sent, so the wait has an end.
-        while self._n_answered < self._n_calls and self._remote.poll(_SECONDS_TO_CLOSE):
+        while self._n_answered < self._n_calls:  # to a call that was interrupted
             self._take()
         # Actions are an array, for which pickle is several times faster; other arguments may come from the main script.
         dumps = pickle.dumps if method == "step" else cloudpickle.dumps
         message = dumps((method, args, kwargs))
-        self._n_calls += 1
-        self._remote.send_bytes(_NUMBER.pack(self._n_calls) + message)
+        with _uninterrupted():
+            self._remote.send_bytes(_NUMBER.pack(self._n_calls + 1) + message)
+            self._n_calls += 1
 
     def receive(self) -> tuple[str, Any]:
         """Wait for the answer to the last call."""
@@ -362,8 +362,10 @@ class _Worker:
         return kind, value
 
     def _take(self) -> bytes:
-        message = self._remote.recv_bytes()
-        self._n_answered = _NUMBER.unpack_from(message)[0]
+        self._remote.poll(None)
+        with _uninterrupted():
+            message = self._remote.recv_bytes()
+            self._n_answered = _NUMBER.unpack_from(message)[0]
         return message
 
     def close(self) -> None:
@@ -456,6 +458,25 @@ def _work(remote: Connection, pickled_venv_fn: bytes, seconds_awake: float) -> N
     if group is not None:
         group.venv.close()
     remote.close()
+
+
+@contextlib.contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Put Ctrl-C and a request to terminate off to the end of the block; only the main thread knows interrupts."""
+    put_off: list[tuple[int, Any]] = []
+    handlers: dict[int, Any] = {}
+    try:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                if callable(handler := signal.getsignal(number)):
+                    handlers[number] = handler
+                    signal.signal(number, lambda *arguments: put_off.append(arguments))
+        yield
+    finally:
+        for restored, handler in handlers.items():
+            signal.signal(restored, handler)
+    for interrupt, frame in put_off:
+        handlers[interrupt](interrupt, frame)
 
 
 def _watch(remote: Connection, seconds: float) -> None:
