@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,37 +16,57 @@ Place = Sequence[float]
 #: Tells of a start and a target whether they fit those of the objects before, which are given after them.
 Fits = Callable[[Place, Place, Sequence[Place], Sequence[Place]], bool]
 
+#: Tells the same of many candidates: arrays ``(n, d)`` in, ``(n,)`` out.
+Screen = Callable[[Points, Points, Sequence[Place], Sequence[Place]], NDArray[np.bool_]]
+
 _BATCH = 64
 _BATCHES = 8
+#: With so many objects placed, most candidates do not fit and are screened from the first batch on.
+_CROWDED = 4
 
 
 def sample_in_order(
-    n_objects: int, propose: Callable[[int], tuple[Points, Points]], fits: Fits
+    n_objects: int, propose: Callable[[int], tuple[Points, Points]], fits: Fits, screen: Screen | None = None
 ) -> tuple[Points, Points]:
     """Draw starts and targets one object after the other, each so that it fits those before it.
 
     Candidates are drawn by the batch, but tried one by one up to the first that fits: most fail a cheap test at once,
-    which takes less time with plain numbers than with small arrays. Where an object finds no place, all begin anew.
+    which takes less time with plain numbers than with small arrays. Where the first batch has none, all further ones
+    that an object may have are screened together. Where an object finds no place, all begin anew.
 
     :param n_objects: number of objects
     :param propose: given a number, returns as many candidate starts and targets, ``(number, d)`` each
     :param fits: whether a candidate fits
+    :param screen: leaves few of many candidates, among them all that fit. Given one, more may be drawn than are used
     :return: starts and targets ``(n_objects, d)``
     """
     while True:
         propose(1)  # not used; without it the positions that belong to a seed would be others than they have been
         starts: list[Place] = []
         targets: list[Place] = []
-        while len(starts) < n_objects:
-            for _ in range(_BATCHES):
-                candidates = zip(*(points.tolist() for points in propose(_BATCH)), strict=True)
-                found = next(((one, other) for one, other in candidates if fits(one, other, starts, targets)), None)
-                if found:
-                    starts.append(found[0])
-                    targets.append(found[1])
-                    break
-            else:
+        drawn: list[tuple[Points, Points]] = []
+        for _ in range(n_objects):
+            tried, found = 0, None
+            while found is None and tried < _BATCHES:
+                drawn = drawn or [propose(_BATCH)]
+                if screen and tried:
+                    drawn += [propose(_BATCH) for _ in range(_BATCHES - tried - len(drawn))]
+                    ones, others = (np.concatenate(points) for points in zip(*drawn, strict=True))
+                else:
+                    ones, others = drawn[0]
+                numbers: Iterable[int] = range(len(ones))
+                if screen and (tried or len(starts) >= _CROWDED):
+                    kept = screen(ones, others, starts, targets)
+                    numbers, ones, others = kept.nonzero()[0].tolist(), ones[kept], others[kept]
+                candidates = zip(numbers, ones.tolist(), others.tolist(), strict=True)
+                found = next((some for some in candidates if fits(*some[1:], starts, targets)), None)
+                used = (len(drawn) if screen and tried else 1) if found is None else 1 + found[0] // _BATCH
+                # The next object goes on with the batch after the one that had the place.
+                drawn, tried = drawn[used:], tried + used
+            if found is None:
                 break
+            starts.append(found[1])
+            targets.append(found[2])
         else:
             return np.array(starts), np.array(targets)
 
@@ -72,6 +92,15 @@ def corridor_distance(start: Place, end: Place, other: Place) -> float:
     return math.hypot(to_x - share * x, to_y - share * y)
 
 
+def corridor_distances(starts: Points, ends: Points, others: Points) -> NDArray[np.float64]:
+    """Return :func:`corridor_distance` of many; all are ``(..., 2)`` and broadcast."""
+    ways, to_others = ends - starts, others - starts
+    lengths = np.maximum((ways * ways).sum(axis=-1), 1e-12)
+    shares = np.clip((to_others * ways).sum(axis=-1) / lengths, 0.0, 1.0)
+    offsets = to_others - shares[..., None] * ways
+    return np.hypot(offsets[..., 0], offsets[..., 1])
+
+
 def extended(start: Place, target: Place, back: float) -> Place:
     """Return the point of the table that lies ``back`` metres behind the start, seen from the target."""
     x, y = target[0] - start[0], target[1] - start[1]
@@ -82,3 +111,23 @@ def extended(start: Place, target: Place, back: float) -> Place:
 def reachable(place: Place, least: float = 0.26, most: float = 0.74) -> bool:
     """Return whether the gripper, pointing down, can work at this point of the table."""
     return least <= math.hypot(place[0] - BASE_POSITION[0], place[1] - BASE_POSITION[1]) <= most
+
+
+def all_apart(places: Points, others: Points, distance: float) -> NDArray[np.bool_]:
+    """Return which of many places ``(n, 2)`` are farther than a distance from all others ``(m, 2)``, ``(n,)``."""
+    ways = places[:, None] - others
+    return np.asarray((np.hypot(ways[..., 0], ways[..., 1]) > distance).all(axis=1))
+
+
+def all_extended(starts: Points, targets: Points, back: float) -> Points:
+    """Return :func:`extended` of many, ``(..., 2)``."""
+    ways = targets - starts
+    lengths = np.maximum(np.hypot(ways[..., 0], ways[..., 1]), 1e-9)
+    return np.asarray(starts - (back / lengths)[..., None] * ways)
+
+
+def all_within(starts: Points, ends: Points, least: float, most: float) -> NDArray[np.bool_]:
+    """Return which of many pairs are so far apart, ``(n,)``; places are ``(n, 2)`` or ``(2,)``."""
+    ways = ends - starts
+    distances = np.hypot(ways[:, 0], ways[:, 1])
+    return (least < distances) & (distances < most)
