@@ -195,8 +195,6 @@ class Scene:
             baseCollisionShapeIndex=pybullet.createCollisionShape(geometry, physicsClientId=client, **size),
             baseVisualShapeIndex=self._look(kind) if visual else -1,
             basePosition=(0, 0, 0),
-            # A sliding puck is computed faster as a rigid body of the plain kind, of which towers are less steady.
-            useMaximalCoordinates=kind.shape == "cylinder",
             physicsClientId=client,
         )
         pybullet.changeDynamics(body, -1, lateralFriction=kind.friction, physicsClientId=client)
