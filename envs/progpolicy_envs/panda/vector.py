@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from progpolicy_envs.panda import PandaEnv, PandaPushEnv, PandaReachEnv, PandaSlideEnv, PandaStackEnv
 from progpolicy_envs.panda.env import Observation
-from progpolicy_envs.variation import VariationSpace
 from progpolicy_envs.vector import DomainVectorEnv, Infos, check_num_envs
 
 
@@ -37,6 +36,9 @@ class PandaVectorEnv(DomainVectorEnv):
     env_class: ClassVar[type[PandaEnv]]
     observation_names: ClassVar[tuple[str, ...]] = PandaEnv.observation_names
     action_names: ClassVar[tuple[str, ...]] = PandaEnv.action_names
+
+    def __init_subclass__(cls) -> None:
+        cls.variations = cls.env_class.variations
 
     def __init__(
         self,
@@ -106,25 +108,21 @@ class PandaReachVectorEnv(PandaVectorEnv):
     """N :class:`~progpolicy_envs.panda.PandaReachEnv`; see :class:`PandaVectorEnv`."""
 
     env_class: ClassVar[type[PandaEnv]] = PandaReachEnv
-    variations: ClassVar[VariationSpace] = PandaReachEnv.variations
 
 
 class PandaPushVectorEnv(PandaVectorEnv):
     """N :class:`~progpolicy_envs.panda.PandaPushEnv`; see :class:`PandaVectorEnv`."""
 
     env_class: ClassVar[type[PandaEnv]] = PandaPushEnv
-    variations: ClassVar[VariationSpace] = PandaPushEnv.variations
 
 
 class PandaSlideVectorEnv(PandaVectorEnv):
     """N :class:`~progpolicy_envs.panda.PandaSlideEnv`; see :class:`PandaVectorEnv`."""
 
     env_class: ClassVar[type[PandaEnv]] = PandaSlideEnv
-    variations: ClassVar[VariationSpace] = PandaSlideEnv.variations
 
 
 class PandaStackVectorEnv(PandaVectorEnv):
     """N :class:`~progpolicy_envs.panda.PandaStackEnv`; see :class:`PandaVectorEnv`."""
 
     env_class: ClassVar[type[PandaEnv]] = PandaStackEnv
-    variations: ClassVar[VariationSpace] = PandaStackEnv.variations
