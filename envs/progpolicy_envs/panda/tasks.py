@@ -271,7 +271,7 @@ class Slide(Task):
 class Stack(Task):
     """The blocks stand on each other in colour order at the tower's place, at rest, the gripper away from them."""
 
-    kind = ObjectKind("box", (0.02, 0.02, 0.02), mass=1.0, friction=0.5)
+    kind = ObjectKind("box", (0.02, 0.02, 0.02), mass=1.0, friction=0.5, multibody=True)
     tolerance = 0.03
     #: A block that moves less than this in one control step is at rest, metres.
     rest_motion = 0.001
