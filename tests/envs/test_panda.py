@@ -255,6 +255,10 @@ def test_gripper_goes_straight_where_the_action_says(direction):
     assert np.linalg.norm(way - along * np.array(direction) / np.linalg.norm(direction)) < 0.05 * along
 
 
+def wake(scene, body):
+    pybullet.changeDynamics(body, -1, activationState=pybullet.ACTIVATION_STATE_WAKE_UP, physicsClientId=scene.client)
+
+
 def settle(scene: Scene, seconds: float) -> np.ndarray:
     for _ in range(round(30 * seconds)):
         scene.step()
@@ -338,9 +342,7 @@ def test_a_puck_slides_as_far_as_friction_and_damping_let_it_as_either_kind_of_b
     for physics in (Physics(), Physics(multibodies=True)):
         scene = Scene(Slide.table, Slide.kind, physics)
         scene.place([(-0.1, 0.2, 0.015)])
-        pybullet.changeDynamics(
-            scene.objects[0], -1, activationState=pybullet.ACTIVATION_STATE_WAKE_UP, physicsClientId=scene.client
-        )
+        wake(scene, scene.objects[0])
         scene.step()
         pybullet.resetBaseVelocity(scene.objects[0], (speed, 0, 0), physicsClientId=scene.client)
         assert settle(scene, 3)[0, 0] + 0.1 == pytest.approx(expected, rel=0.1)
@@ -354,9 +356,7 @@ def test_a_block_at_rest_falls_asleep_and_falls_when_what_bears_it_is_taken_away
     asleep = scene.positions[1]
     settle(scene, 0.2)
     assert scene.positions[1] == asleep, "a sleeping block does not move by a single bit"
-    pybullet.changeDynamics(
-        scene.objects[0], -1, activationState=pybullet.ACTIVATION_STATE_WAKE_UP, physicsClientId=scene.client
-    )
+    wake(scene, scene.objects[0])
     scene.step()
     pybullet.resetBaseVelocity(scene.objects[0], (3, 0, 0), physicsClientId=scene.client)
     assert settle(scene, 1)[1, 2] == pytest.approx(0.02, abs=2e-3)
@@ -367,9 +367,7 @@ def test_pushed_block_does_not_tunnel_through_another():
     scene = Scene(Push.table, Push.kind)
     scene.place([(-0.1, 0.0, 0.02), (0.0, 0.0, 0.02)])
     for block in scene.objects[:2]:
-        pybullet.changeDynamics(
-            block, -1, activationState=pybullet.ACTIVATION_STATE_WAKE_UP, physicsClientId=scene.client
-        )
+        wake(scene, block)
     scene.step()
     pybullet.resetBaseVelocity(scene.objects[0], (2, 0, 0), physicsClientId=scene.client)
     (first, *_), (second, *_) = settle(scene, 1).tolist()
