@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 import pathlib
 import uuid
@@ -94,6 +95,9 @@ class ReptilePPO(PPO):
     :param length_coef: price on the expected number of conditions, at least 0; the higher, the shorter the programs
     :param temperature: of the sigmoid in the soft semantics, a number or a schedule of the remaining progress; ``None``
         leaves it as the policy has it
+    :param action_std: standard deviation of Box actions, a number or a schedule of the remaining progress; by default
+        PPO learns it. Programs are read and run without noise, but what is learnt under much noise may rely on it: a
+        schedule towards 0 makes the two agree
     :param interaction_history: append previous action, reward and done to the observation
     :param normalize_observations: shift and scale observations by running statistics (folded into the program)
     :param scale_rewards: divide rewards by the running deviation of the return
@@ -143,6 +147,7 @@ class ReptilePPO(PPO):
         search_fraction: float = 0.5,
         length_coef: float = 0.005,
         temperature: float | Schedule | None = None,
+        action_std: float | Schedule | None = None,
         interaction_history: bool = True,
         normalize_observations: bool = False,
         scale_rewards: bool = False,
@@ -177,7 +182,8 @@ class ReptilePPO(PPO):
         self.inner_updates, self.tasks_per_iteration = inner_updates, tasks_per_iteration
         self.meta_learning_rate = meta_learning_rate
         self.meta_optimizer, self.meta_update = meta_optimizer, meta_update
-        self.search_fraction, self.length_coef, self.temperature = search_fraction, length_coef, temperature
+        self.search_fraction, self.length_coef = search_fraction, length_coef
+        self.temperature, self.action_std = temperature, action_std
         self.normalize_observations = normalize_observations
         self.reward_scaler = RewardScaler(gamma) if scale_rewards else None
         self.input_names: tuple[str, ...] | None = None
@@ -216,6 +222,8 @@ class ReptilePPO(PPO):
     def _setup_model(self) -> None:
         super()._setup_model()
         self._check_sequences()
+        if self.action_std is not None and not hasattr(self.policy, "log_std"):
+            raise ValueError(f"action_std is for Box actions, not {self.action_space}")
         self.reptile = _Reptile(
             self.tasks,
             self.inner_updates,
@@ -285,6 +293,7 @@ class ReptilePPO(PPO):
         callback.on_rollout_start()
         if self.temperature is not None and isinstance(self.policy, ProgrammaticActorCritic):
             self.policy.set_temperature(FloatSchedule(self.temperature)(self._current_progress_remaining))
+        self._set_action_std()
         self._sampler = self._make_sampler(n_rollout_steps)
         # States at which the sequences of the update start.
         self._sequence_states: list[RNNStates] = []
@@ -429,13 +438,24 @@ class ReptilePPO(PPO):
 
     def _freeze(self, derivation: bool, phi: bool) -> None:
         """Freeze W, or phi, or neither."""
-        if not isinstance(self.policy, ProgrammaticActorCritic):
+        if isinstance(self.policy, ProgrammaticActorCritic):
+            self.policy.optimizer.zero_grad()
+            for parameter in self.policy.derivation_parameters():
+                parameter.requires_grad_(not derivation)
+            for parameter in self.policy.phi():
+                parameter.requires_grad_(not phi)
+        if self.action_std is not None:
+            self.policy.log_std.requires_grad_(False)
+
+    @th.no_grad()
+    def _set_action_std(self) -> None:
+        """Let the standard deviation of the actions follow its schedule, if it has one."""
+        if self.action_std is None:
             return
-        self.policy.optimizer.zero_grad()
-        for parameter in self.policy.derivation_parameters():
-            parameter.requires_grad_(not derivation)
-        for parameter in self.policy.phi():
-            parameter.requires_grad_(not phi)
+        deviation = FloatSchedule(self.action_std)(self._current_progress_remaining)
+        if not deviation > 0:
+            raise ValueError(f"action_std={deviation} is not accepted; it is above 0")
+        self.policy.log_std.fill_(math.log(deviation))
 
     @th.no_grad()
     def _derivation_terms(self, rollout: Mapping[str, th.Tensor]) -> th.Tensor:

@@ -49,7 +49,7 @@ _OWN_POLICIES: dict[type[OnPolicyAlgorithm], dict[str, Any]] = {
     RecurrentPPO: {"ProgPolicy": RecurrentProgrammaticPolicy},
 }
 _REPTILE = ("tasks", "inner_updates", "tasks_per_iteration", "meta_learning_rate", "meta_optimizer", "meta_update")
-_SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "meta_learning_rate", "temperature")
+_SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "meta_learning_rate", "temperature", "action_std")
 # Arguments of the constructors that have a flag of their own or no place in a file.
 _ELSEWHERE = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
 _ELSEWHERE |= {"rollout_buffer_class", "rollout_buffer_kwargs"}
@@ -144,7 +144,7 @@ def _checked(name: str, value: Any, default: Any) -> Any:
         return parse_kwargs(name, value)
     if name in _SCHEDULES:
         if value is not None and not isinstance(value, str):
-            return _number(name, value, "a number or lin_<number>")
+            return _number(name, value, "a number, lin_<from> or lin_<from>_<to>")
         if isinstance(value, str):
             _schedule(name, value)
         return value
@@ -171,14 +171,17 @@ def _number(name: str, value: Any, accepted: str) -> float:
 
 
 def _schedule(name: str, value: Any) -> Any:
-    """Return the zoo's ``lin_0.001``, which falls linearly to 0, as a schedule, and anything else as it is."""
+    """Return a text as a linear schedule, and anything else as it is.
+
+    The zoo's ``lin_0.001`` falls to 0 at the end of the training; ``lin_0.5_0.1`` goes from the first to the second.
+    """
     if not isinstance(value, str):
         return value
-    kind, _, start = value.partition("_")
-    number = parse_number(start)
-    if kind != "lin" or not isinstance(number, float):
-        raise ValueError(f"{name}={value!r} is not accepted; it is a number or lin_<number>")
-    return LinearSchedule(number, 0.0, 1.0)
+    kind, *numbers = value.split("_")
+    ends = [parse_number(number) for number in numbers]
+    if kind != "lin" or len(ends) not in (1, 2) or not all(isinstance(end, (int, float)) for end in ends):
+        raise ValueError(f"{name}={value!r} is not accepted; it is a number, lin_<from> or lin_<from>_<to>")
+    return LinearSchedule(float(ends[0]), float(ends[1]) if len(ends) == 2 else 0.0, 1.0)
 
 
 def _check_policy(config: RunConfig) -> None:

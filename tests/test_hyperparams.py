@@ -54,6 +54,12 @@ def test_linear_schedule_falls_to_zero():
     assert [model.lr_schedule(remaining) for remaining in (1.0, 0.5, 0.0)] == pytest.approx([0.002, 0.001, 0.0])
 
 
+def test_linear_schedule_goes_from_one_number_to_another():
+    config = make_config("reptile_ppo", "PandaReach-v0", 0, overrides={"action_std": "lin_0.5_0.1", "n_envs": 4})
+    model, _ = build_model(config)
+    assert [model.action_std(remaining) for remaining in (1.0, 0.5, 0.0)] == pytest.approx([0.5, 0.3, 0.1])
+
+
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
@@ -61,7 +67,9 @@ def test_linear_schedule_falls_to_zero():
         ({"n_steps": "abc"}, "n_steps='abc'"),
         ({"n_steps": 0}, "at least 1"),
         ({"n_steps": 2.5}, "whole number"),
-        ({"learning_rate": "exp_0.1"}, "lin_<number>"),
+        ({"learning_rate": "exp_0.1"}, "lin_<from>"),
+        ({"action_std": "lin_0.5_0.1_0"}, "lin_<from>"),
+        ({"action_std": "lin_a"}, "lin_<from>"),
         ({"meta_update": 1}, "true or false"),
         ({"policy": "ProgPol"}, "nearest: ProgPolicy"),
         ({"policy_kwargs": {"dept": 3}}, "nearest: depth"),

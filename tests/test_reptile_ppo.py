@@ -276,6 +276,24 @@ def test_temperature_follows_its_schedule():
     assert sorted(set(temperatures), reverse=True) == pytest.approx([1.1, 0.85, 0.6, 0.35])
 
 
+@pytest.mark.parametrize("policy", POLICIES)
+def test_deviation_of_the_actions_follows_its_schedule_and_is_not_learnt(policy):
+    env = DummyVecEnv([lambda: OneStep(spaces.Box(-1, 1, (2, 3), np.float32))] * 4)
+    deviations = []
+    model = make(policy, env, action_std=lambda left: 0.01 + left, ent_coef=0.1, meta_update=False)
+    model.learn(64 * 4, callback=Each(lambda m, _: deviations.extend(m.policy.log_std.exp().tolist())))
+    assert sorted({round(deviation, 5) for deviation in deviations}, reverse=True) == [1.01, 0.76, 0.51, 0.26]
+    assert model.policy.log_std.exp().tolist() == pytest.approx([0.26] * 6), "the last update left it alone"
+
+
+def test_deviation_that_is_not_accepted():
+    with pytest.raises(ValueError, match="for Box actions"):
+        make(action_std=0.5)
+    env = DummyVecEnv([lambda: OneStep(spaces.Box(-1, 1, (2,), np.float32))] * 4)
+    with pytest.raises(ValueError, match="above 0"):
+        make(env=env, action_std=0.0).learn(64)
+
+
 # What is accepted
 
 
