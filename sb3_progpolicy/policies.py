@@ -23,7 +23,6 @@ from torch import nn
 from sb3_progpolicy.interaction import action_spec
 from sb3_progpolicy.normalization import NormalizingExtractor
 from sb3_progpolicy.programs.modules import Conditions, ProgramModule, State
-from sb3_progpolicy.programs.search import DerivationInit
 from sb3_progpolicy.programs.syntax import ActionSpec, Cell, Program
 
 # W is one number per layer and has few updates to decide in, so that it takes larger steps than the controllers.
@@ -58,8 +57,6 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
     :param cell: ``"gru"``, ``"lstm"``, ``"rnn"`` or ``"affine"``
     :param condition_size: hidden units per condition
     :param temperature: of the sigmoid in the soft semantics, above 0
-    :param derivation_init: what is equally likely when the search begins: ``"choices"`` between ending a program and
-        going on, as in the paper, which halves a program's probability with each condition, or ``"programs"``
     :param net_arch: hidden layers of the critic
     :param activation_fn: of the critic
     :param log_std_init: initial logarithm of the standard deviation of Box actions
@@ -80,7 +77,6 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
         cell: Cell = "gru",
         condition_size: int = 1,
         temperature: float = 1.0,
-        derivation_init: DerivationInit = "choices",
         net_arch: list[int] | None = None,
         activation_fn: type[nn.Module] = nn.ReLU,
         log_std_init: float = 0.0,
@@ -103,7 +99,6 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
             "cell": cell,
             "condition_size": condition_size,
             "temperature": temperature,
-            "derivation_init": derivation_init,
         }
         self.spec_of_actions: ActionSpec = action_spec(action_space)
         self.reset_state_at_episode_start = reset_state_at_episode_start

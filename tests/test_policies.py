@@ -94,7 +94,7 @@ def test_saved_and_loaded_model_acts_alike_and_trains_on(algorithm, policy, env_
 
 @BOTH
 def test_policy_alone_is_saved_and_loaded(algorithm, policy, tmp_path):
-    kwargs = {"depth": 3, "condition_size": 2, "net_arch": [8], "temperature": 0.3, "derivation_init": "programs"}
+    kwargs = {"depth": 3, "condition_size": 2, "net_arch": [8], "temperature": 0.3}
     model = make(algorithm, policy, "Pendulum-v1", policy_kwargs=kwargs)
     model.policy.save(tmp_path / "policy.pth")
     loaded = policy.load(tmp_path / "policy.pth")
@@ -172,7 +172,6 @@ def test_program_of_a_policy_reads_what_the_policy_reads():
         (ProgrammaticPolicy, {"cell": "gru"}, "RecurrentProgrammaticPolicy"),
         (ProgrammaticPolicy, {"depth": 0}, "depth=0"),
         (ProgrammaticPolicy, {"temperature": 0.0}, "temperature=0.0"),
-        (ProgrammaticPolicy, {"derivation_init": "uniform"}, '"choices" or "programs"'),
         (RecurrentProgrammaticPolicy, {"condition_size": 0}, "condition size 0"),
         (RecurrentProgrammaticPolicy, {"use_sde": True}, "use_sde=True"),
     ],

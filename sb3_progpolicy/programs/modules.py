@@ -10,7 +10,7 @@ from torch import nn
 
 from sb3_progpolicy.programs.grammar import derivations
 from sb3_progpolicy.programs.recurrence import scan
-from sb3_progpolicy.programs.search import DerivationInit, DerivationSearch
+from sb3_progpolicy.programs.search import DerivationSearch
 from sb3_progpolicy.programs.syntax import GATES, ActionSpec, Cell, Condition, Controller, Expression, IfThenElse
 
 State = tuple[th.Tensor, th.Tensor]
@@ -148,7 +148,6 @@ class ProgramModule(nn.Module):
     :param cell: see :class:`Conditions`
     :param condition_size: hidden units per condition
     :param temperature: of the sigmoid, above 0; towards 0 the soft semantics becomes the crisp one
-    :param derivation_init: where the search begins, see :class:`DerivationSearch`
     """
 
     def __init__(
@@ -159,7 +158,6 @@ class ProgramModule(nn.Module):
         cell: Cell = "gru",
         condition_size: int = 1,
         temperature: float = 1.0,
-        derivation_init: DerivationInit = "choices",
     ) -> None:
         super().__init__()
         self.n_inputs, self.action, self.depth = n_inputs, action, depth
@@ -167,7 +165,7 @@ class ProgramModule(nn.Module):
         self.conditions = Conditions(n_inputs, depth - 1, cell, condition_size)
         # Rows: the then-controllers C'_1 ... C'_K, then the last controllers C_1 ... C_depth.
         self.controllers = nn.Linear(n_inputs, (2 * depth - 1) * action.n_outputs)
-        self.search = DerivationSearch(depth, derivation_init)
+        self.search = DerivationSearch(depth)
         self.temperature: th.Tensor
         self.register_buffer("temperature", th.tensor(float(temperature)))
 

@@ -2,37 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
-
 import torch as th
 from torch import nn
 
 SEARCHING = -1
-#: What is equally likely when the search begins.
-DerivationInit = Literal["choices", "programs"]
 
 
 class DerivationSearch(nn.Module):
     """The vector W: one binary choice per layer, between ``E ::= C`` and ``E ::= if B then C else E``.
 
-    A softmax over each pair of logits gives the probability of a choice. The probability of a program is the product of
-    its choices. After :meth:`select` one program has probability 1.
+    A softmax over each pair of logits gives the probability of a choice; both start at 50 %. The probability of a
+    program is the product of its choices. After :meth:`select` one program has probability 1.
 
     :param depth: layers of the derivation graph; the last layer has no choice
-    :param init: what is equally likely at the start: ``"choices"``, as in the paper, so that each further condition
-        halves a program's probability, or ``"programs"``
-    :raises ValueError: if ``init`` is neither
     """
 
-    def __init__(self, depth: int, init: DerivationInit = "choices") -> None:
+    def __init__(self, depth: int) -> None:
         super().__init__()
-        if init not in get_args(DerivationInit):
-            raise ValueError(f'derivation_init={init!r} is not accepted; it is "choices" or "programs"')
-        logits = th.zeros(depth - 1, 2)
-        if init == "programs":
-            # Layer k ends in one program and goes on to depth - k others.
-            logits[:, 1] = th.arange(depth - 1, 0, -1).log()
-        self.logits = nn.Parameter(logits)
+        self.logits = nn.Parameter(th.zeros(depth - 1, 2))
         self.selected: th.Tensor
         self.register_buffer("selected", th.tensor(SEARCHING))
         self._indices: th.Tensor
@@ -75,7 +62,7 @@ class DerivationSearch(nn.Module):
         return self.at_least().sum()
 
     def entropy(self) -> th.Tensor:
-        """Return the entropy of W in nats: 0 when it has decided, at most ``log(2)`` per layer."""
+        """Return the entropy of W in nats: 0 when it has decided, ``log(2)`` per layer at the start."""
         if not self.searching or not len(self.logits):
             return self.logits.new_zeros(())
         log_choice = self.logits.log_softmax(-1)

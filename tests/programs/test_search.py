@@ -25,13 +25,6 @@ def test_choices_start_at_even_odds():
 
 
 @pytest.mark.parametrize("depth", [1, 2, 6])
-def test_programs_start_at_even_odds_on_demand(depth):
-    search = DerivationSearch(depth, "programs")
-    assert search.probabilities().tolist() == pytest.approx([1 / depth] * depth)
-    assert search.logits.requires_grad
-
-
-@pytest.mark.parametrize("depth", [1, 2, 6])
 def test_probabilities_are_products_of_choices(depth):
     th.manual_seed(depth)
     search = DerivationSearch(depth)
