@@ -437,7 +437,7 @@ class ReptilePPO(PPO):
             self.policy.features_extractor.update(observations.reshape(-1, observations.shape[-1]))
 
     def _freeze(self, derivation: bool, phi: bool) -> None:
-        """Freeze W, or phi, or neither."""
+        """Freeze W, or phi, or neither; a scheduled ``action_std`` is never trained."""
         if isinstance(self.policy, ProgrammaticActorCritic):
             self.policy.optimizer.zero_grad()
             for parameter in self.policy.derivation_parameters():

@@ -179,9 +179,9 @@ def _schedule(name: str, value: Any) -> Any:
         return value
     kind, *numbers = value.split("_")
     ends = [parse_number(number) for number in numbers]
-    if kind != "lin" or len(ends) not in (1, 2) or not all(isinstance(end, (int, float)) for end in ends):
+    if kind != "lin" or len(ends) not in (1, 2) or not all(isinstance(end, float) for end in ends):
         raise ValueError(f"{name}={value!r} is not accepted; it is a number, lin_<from> or lin_<from>_<to>")
-    return LinearSchedule(float(ends[0]), float(ends[1]) if len(ends) == 2 else 0.0, 1.0)
+    return LinearSchedule(ends[0], ends[1] if len(ends) == 2 else 0.0, 1.0)
 
 
 def _check_policy(config: RunConfig) -> None:
