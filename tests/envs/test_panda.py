@@ -16,7 +16,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 import progpolicy_envs
 from progpolicy_envs.panda.robot import arm_angles
-from progpolicy_envs.panda.scene import CONTROL_STEP, Physics, Scene
+from progpolicy_envs.panda.scene import BULLET_MARGIN, CONTROL_STEP, PANDA_GYM_PHYSICS, Physics, Scene
 from progpolicy_envs.panda.tasks import Push, Slide, Stack
 from progpolicy_envs.planners.panda import CONTROLLERS
 
@@ -336,17 +336,48 @@ def test_physics_steps_made_in_one_call_are_those_made_in_many(env_id, physics, 
     assert np.array_equal(few, trajectory())
 
 
-def test_a_puck_slides_as_far_as_friction_and_damping_let_it_as_either_kind_of_body():
+def push_off(scene: Scene, velocity: tuple[float, float, float]) -> None:
+    """Wake the first object and give it a velocity, in metres per second."""
+    wake(scene, scene.objects[0])
+    scene.step()
+    pybullet.resetBaseVelocity(scene.objects[0], velocity, physicsClientId=scene.client)
+
+
+@pytest.mark.parametrize(("physics", "tolerance"), [(Physics(), 0.02), (PANDA_GYM_PHYSICS, 0.05)])
+def test_a_puck_slides_as_far_as_friction_and_damping_let_it(physics, tolerance):
     speed, friction, gravity, damping = 0.4, Slide.kind.friction * 0.5, 9.81, 0.04
     expected = speed / damping - friction * gravity / damping**2 * np.log1p(damping * speed / (friction * gravity))
-    for physics in (Physics(), Physics(multibodies=True)):
-        scene = Scene(Slide.table, Slide.kind, physics)
-        scene.place([(-0.1, 0.2, 0.015)])
-        wake(scene, scene.objects[0])
+    scene = Scene(Slide.table, Slide.kind, physics)
+    scene.place([(-0.1, 0.2, 0.015)])
+    push_off(scene, (speed, 0, 0))
+    assert settle(scene, 3)[0, 0] + 0.1 == pytest.approx(expected, rel=tolerance)
+    scene.close()
+
+
+@pytest.mark.parametrize("task", [Push, Slide, Stack])
+@pytest.mark.parametrize(("vx", "vy"), [(1.0, 0.0), (0.7, 0.7), (0.3, -0.1)])
+def test_what_slides_goes_straight_and_neither_sinks_in_nor_tilts(task, vx, vy):
+    scene = Scene(task.table, task.kind)
+    height = task.kind.height
+    scene.place([(-0.3, -0.1, height)])
+    push_off(scene, (vx, vy, 0))
+    for _ in range(15):
         scene.step()
-        pybullet.resetBaseVelocity(scene.objects[0], (speed, 0, 0), physicsClientId=scene.client)
-        assert settle(scene, 3)[0, 0] + 0.1 == pytest.approx(expected, rel=0.1)
-        scene.close()
+        (x, y, z), (qx, qy, _, _) = pybullet.getBasePositionAndOrientation(scene.objects[0], scene.client)
+        assert z == pytest.approx(height, abs=2e-4)
+        assert 2 * np.hypot(qx, qy) < 0.005, "radians from upright"
+        way_x, way_y = x + 0.3, y + 0.1
+        assert way_x * vy - way_y * vx == pytest.approx(0, abs=0.02 * np.hypot(way_x, way_y))
+    scene.close()
+
+
+def test_a_puck_turns_as_lightly_as_a_cylinder():
+    scene = Scene(Slide.table, Slide.kind)
+    mass, _, inertia = pybullet.getDynamicsInfo(scene.objects[0], -1, scene.client)[:3]
+    (radius, _, half), kind = Slide.kind.half_extents, Slide.kind
+    across = kind.mass * (radius**2 / 4 + half**2 / 3)
+    assert (mass, *inertia) == pytest.approx((kind.mass, across, across, kind.mass * radius**2 / 2))
+    scene.close()
 
 
 def test_a_block_at_rest_falls_asleep_and_falls_when_what_bears_it_is_taken_away():
@@ -361,6 +392,23 @@ def test_a_block_at_rest_falls_asleep_and_falls_when_what_bears_it_is_taken_away
     pybullet.resetBaseVelocity(scene.objects[0], (3, 0, 0), physicsClientId=scene.client)
     assert settle(scene, 1)[1, 2] == pytest.approx(0.02, abs=2e-3)
     scene.close()
+
+
+def test_other_worlds_of_the_process_keep_their_margin_around_bodies():
+    env = make("PandaPush-v0", 3)
+    env.reset(seed=0)
+    assert env.unwrapped.scene.physics.margin < BULLET_MARGIN
+    other = pybullet.connect(pybullet.DIRECT)
+    box = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=[0.1] * 3, physicsClientId=other)
+    body = pybullet.createMultiBody(1, box, physicsClientId=other)
+    for beyond, found in ((0.9, True), (1.1, False)):
+        env.step(env.action_space.sample())
+        pybullet.performCollisionDetection(physicsClientId=other)
+        spot = (0.1 + beyond * BULLET_MARGIN, 0, 0)
+        near = pybullet.getOverlappingObjects(spot, spot, physicsClientId=other) or ()
+        assert (body in [near_body for near_body, _ in near]) == found
+    pybullet.disconnect(other)
+    env.close()
 
 
 def test_pushed_block_does_not_tunnel_through_another():

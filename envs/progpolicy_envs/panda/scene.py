@@ -11,7 +11,7 @@ import pybullet
 import pybullet_data
 
 from progpolicy_envs.panda.robot import PandaRobot
-from progpolicy_envs.panda.shapes import visual_drum
+from progpolicy_envs.panda.shapes import bearing_box, drum_inertia, footed_drum, visual_drum
 
 MAX_OBJECTS = 8
 #: Seconds of one control step.
@@ -25,6 +25,8 @@ LIFT_HEIGHT = 0.005
 STILL_MOTION, STILL_STEPS = 1e-5, 3
 #: An object whose centre is this far below the table's top has left the table, metres.
 FALL_DEPTH = 0.05
+#: By how much Bullet enlarges all bodies to find those that may touch, metres.
+BULLET_MARGIN = 0.02
 
 Point = tuple[float, float, float]
 
@@ -47,7 +49,11 @@ class Physics:
     :param delicate_iterations: iterations of the contact solver while the world is delicate
     :param sleeping: whether bodies at rest are left out of the simulation until something touches them; an object
         falls asleep after a tenth of a second of rest, for which Bullet itself would wait two seconds
-    :param multibodies: whether all objects are multibodies, or only those whose kind asks for it
+    :param margin: by how much all bodies are enlarged to find those that may touch, metres, while the world is not
+        delicate; a small one lets more of what lies near the hand sleep
+    :param plain_bodies: whether table and objects are what PyBullet makes of them by itself, as in panda-gym:
+        multibodies, each a box or a cylinder. Otherwise the table, and every object whose kind does not ask for a
+        multibody, are rigid bodies, and their shapes are such that what slides does not sink in
     """
 
     frequency: int = 120
@@ -56,7 +62,8 @@ class Physics:
     delicate_substeps: int = 8
     delicate_iterations: int = 60
     sleeping: bool = True
-    multibodies: bool = False
+    margin: float = 0.005
+    plain_bodies: bool = False
 
     @property
     def control_step(self) -> float:
@@ -72,7 +79,8 @@ PANDA_GYM_PHYSICS = Physics(
     delicate_substeps=20,
     delicate_iterations=50,
     sleeping=False,
-    multibodies=True,
+    margin=BULLET_MARGIN,
+    plain_bodies=True,
 )
 
 
@@ -173,17 +181,19 @@ class Scene:
         table = self.table
         half = [(table.high_x - table.low_x) / 2, table.width / 2, TABLE_HEIGHT / 2]
         look = {"halfExtents": half, "rgbaColor": [0.93, 0.92, 0.9, 1], "specularColor": [0, 0, 0]}
-        client = self.client
+        client, plain = self.client, self.physics.plain_bodies
         # A rigid body of the plain kind: with a multibody, just as fixed, contacts take 40 % more work to solve.
         body = pybullet.createMultiBody(
             baseCollisionShapeIndex=pybullet.createCollisionShape(
                 pybullet.GEOM_BOX, halfExtents=half, physicsClientId=client
-            ),
+            )
+            if plain
+            else bearing_box(half, client),
             baseVisualShapeIndex=pybullet.createVisualShape(pybullet.GEOM_BOX, physicsClientId=client, **look)
             if visual
             else -1,
             basePosition=[(table.low_x + table.high_x) / 2, 0, -TABLE_HEIGHT / 2],
-            useMaximalCoordinates=True,
+            useMaximalCoordinates=not plain,
             physicsClientId=client,
         )
         if self.physics.sleeping:
@@ -193,23 +203,30 @@ class Scene:
 
     def _build_object(self, visual: bool) -> int:
         assert self.kind is not None
-        client, kind = self.client, self.kind
-        multibody = kind.multibody or self.physics.multibodies
+        client, kind, plain = self.client, self.kind, self.physics.plain_bodies
+        multibody = kind.multibody or plain
         radius, height = kind.half_extents[0], 2 * kind.half_extents[2]
         if kind.shape == "box":
-            geometry = pybullet.GEOM_BOX
-            size: dict[str, Any] = {"halfExtents": kind.half_extents}
+            shape = pybullet.createCollisionShape(
+                pybullet.GEOM_BOX, halfExtents=kind.half_extents, physicsClientId=client
+            )
+        elif plain:
+            shape = pybullet.createCollisionShape(
+                pybullet.GEOM_CYLINDER, radius=radius, height=height, physicsClientId=client
+            )
         else:
-            geometry = pybullet.GEOM_CYLINDER
-            size = {"radius": radius, "height": height}
+            shape = footed_drum(radius, height, client)
         body: int = pybullet.createMultiBody(
             baseMass=kind.mass,
-            baseCollisionShapeIndex=pybullet.createCollisionShape(geometry, physicsClientId=client, **size),
+            baseCollisionShapeIndex=shape,
             baseVisualShapeIndex=self._look(kind) if visual else -1,
             basePosition=(0, 0, 0),
             useMaximalCoordinates=not multibody,
             physicsClientId=client,
         )
+        if kind.shape == "cylinder":
+            inertia = drum_inertia(kind.mass, radius, height)
+            pybullet.changeDynamics(body, -1, kind.mass, localInertiaDiagonal=inertia, physicsClientId=client)
         pybullet.changeDynamics(body, -1, lateralFriction=kind.friction, physicsClientId=client)
         if not multibody:
             # What a multibody has from the start.
@@ -274,8 +291,18 @@ class Scene:
     def simulate(self) -> None:
         """Compute the physics of one control step."""
         step, client = pybullet.stepSimulation, self.client
-        for _ in self._calls:
-            step(client)
+        if self._margin == BULLET_MARGIN:
+            for _ in self._calls:
+                step(client)
+            return
+        # Bullet keeps the margin in a variable of the whole process, so other worlds get theirs back at once.
+        set_engine = pybullet.setPhysicsEngineParameter
+        set_engine(contactBreakingThreshold=self._margin, physicsClientId=client)
+        try:
+            for _ in self._calls:
+                step(client)
+        finally:
+            set_engine(contactBreakingThreshold=BULLET_MARGIN, physicsClientId=client)
 
     def take_over(self) -> None:
         """Read the state after the physics and let things that lie still fall asleep."""
@@ -294,6 +321,7 @@ class Scene:
     def _set_delicate(self, delicate: bool) -> None:
         physics = self.physics
         self._delicate = delicate
+        self._margin = BULLET_MARGIN if delicate or not self.objects else physics.margin
         substeps = physics.delicate_substeps if delicate else physics.substeps
         # Bullet divides seconds in each call to find how many steps it makes, which is exact for powers of two.
         self._set_steps(substeps // (substeps & -substeps), substeps & -substeps)
