@@ -51,7 +51,7 @@ class Physics:
         falls asleep after a tenth of a second of rest, for which Bullet itself would wait two seconds
     :param margin: by how much all bodies are enlarged to find those that may touch, metres, while the world is not
         delicate; a small one lets more of what lies near the hand sleep
-    :param plain_bodies: whether table and objects are what PyBullet makes of them by itself, as in panda-gym:
+    :param stock_bodies: whether table and objects are what PyBullet makes of them by itself, as in panda-gym:
         multibodies, each a box or a cylinder. Otherwise the table, and every object whose kind does not ask for a
         multibody, are rigid bodies, and their shapes are such that what slides does not sink in
     """
@@ -63,7 +63,7 @@ class Physics:
     delicate_iterations: int = 60
     sleeping: bool = True
     margin: float = 0.005
-    plain_bodies: bool = False
+    stock_bodies: bool = False
 
     @property
     def control_step(self) -> float:
@@ -80,7 +80,7 @@ PANDA_GYM_PHYSICS = Physics(
     delicate_iterations=50,
     sleeping=False,
     margin=BULLET_MARGIN,
-    plain_bodies=True,
+    stock_bodies=True,
 )
 
 
@@ -181,19 +181,20 @@ class Scene:
         table = self.table
         half = [(table.high_x - table.low_x) / 2, table.width / 2, TABLE_HEIGHT / 2]
         look = {"halfExtents": half, "rgbaColor": [0.93, 0.92, 0.9, 1], "specularColor": [0, 0, 0]}
-        client, plain = self.client, self.physics.plain_bodies
+        client, stock = self.client, self.physics.stock_bodies
+        shape = (
+            pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, physicsClientId=client)
+            if stock
+            else bearing_box(half, client)
+        )
         # A rigid body of the plain kind: with a multibody, just as fixed, contacts take 40 % more work to solve.
         body = pybullet.createMultiBody(
-            baseCollisionShapeIndex=pybullet.createCollisionShape(
-                pybullet.GEOM_BOX, halfExtents=half, physicsClientId=client
-            )
-            if plain
-            else bearing_box(half, client),
+            baseCollisionShapeIndex=shape,
             baseVisualShapeIndex=pybullet.createVisualShape(pybullet.GEOM_BOX, physicsClientId=client, **look)
             if visual
             else -1,
             basePosition=[(table.low_x + table.high_x) / 2, 0, -TABLE_HEIGHT / 2],
-            useMaximalCoordinates=not plain,
+            useMaximalCoordinates=not stock,
             physicsClientId=client,
         )
         if self.physics.sleeping:
@@ -203,29 +204,18 @@ class Scene:
 
     def _build_object(self, visual: bool) -> int:
         assert self.kind is not None
-        client, kind, plain = self.client, self.kind, self.physics.plain_bodies
-        multibody = kind.multibody or plain
-        radius, height = kind.half_extents[0], 2 * kind.half_extents[2]
-        if kind.shape == "box":
-            shape = pybullet.createCollisionShape(
-                pybullet.GEOM_BOX, halfExtents=kind.half_extents, physicsClientId=client
-            )
-        elif plain:
-            shape = pybullet.createCollisionShape(
-                pybullet.GEOM_CYLINDER, radius=radius, height=height, physicsClientId=client
-            )
-        else:
-            shape = footed_drum(radius, height, client)
+        client, kind = self.client, self.kind
+        multibody = kind.multibody or self.physics.stock_bodies
         body: int = pybullet.createMultiBody(
             baseMass=kind.mass,
-            baseCollisionShapeIndex=shape,
+            baseCollisionShapeIndex=self._solid(kind),
             baseVisualShapeIndex=self._look(kind) if visual else -1,
             basePosition=(0, 0, 0),
             useMaximalCoordinates=not multibody,
             physicsClientId=client,
         )
         if kind.shape == "cylinder":
-            inertia = drum_inertia(kind.mass, radius, height)
+            inertia = drum_inertia(kind.mass, kind.half_extents[0], 2 * kind.half_extents[2])
             pybullet.changeDynamics(body, -1, kind.mass, localInertiaDiagonal=inertia, physicsClientId=client)
         pybullet.changeDynamics(body, -1, lateralFriction=kind.friction, physicsClientId=client)
         if not multibody:
@@ -234,6 +224,18 @@ class Scene:
         if self.physics.sleeping:
             self._activate(body, pybullet.ACTIVATION_STATE_ENABLE_SLEEPING)
         return body
+
+    def _solid(self, kind: ObjectKind) -> int:
+        size, client = kind.half_extents, self.client
+        if kind.shape == "box":
+            return int(pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=size, physicsClientId=client))
+        radius, height = size[0], 2 * size[2]
+        if self.physics.stock_bodies:
+            shape: int = pybullet.createCollisionShape(
+                pybullet.GEOM_CYLINDER, radius=radius, height=height, physicsClientId=client
+            )
+            return shape
+        return footed_drum(radius, height, client)
 
     def _look(self, kind: ObjectKind) -> int:
         matt = {"specularColor": [0, 0, 0], "physicsClientId": self.client}
