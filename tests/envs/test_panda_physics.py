@@ -202,7 +202,7 @@ def test_a_block_at_rest_falls_asleep_and_falls_when_what_bears_it_is_taken_away
 def test_other_worlds_of_the_process_keep_their_margin_around_bodies():
     env = gym.make("PandaPush-v0", disable_env_checker=True, n_objects=3)
     env.reset(seed=0)
-    assert env.unwrapped.scene.physics.margin < BULLET_MARGIN
+    assert env.unwrapped.scene.physics.contact_margin < BULLET_MARGIN
     other = pybullet.connect(pybullet.DIRECT)
     box = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=[0.1] * 3, physicsClientId=other)
     body = pybullet.createMultiBody(1, box, physicsClientId=other)

@@ -49,8 +49,8 @@ class Physics:
     :param delicate_iterations: iterations of the contact solver while the world is delicate
     :param sleeping: whether bodies at rest are left out of the simulation until something touches them; an object
         falls asleep after a tenth of a second of rest, for which Bullet itself would wait two seconds
-    :param margin: by how much all bodies are enlarged to find those that may touch, metres, while the world is not
-        delicate; a small one lets more of what lies near the hand sleep
+    :param contact_margin: by how much all bodies are enlarged to find those that may touch, metres, while the world is
+        not delicate; a small one lets more of what lies near the hand sleep
     :param stock_bodies: whether table and objects are what PyBullet makes of them by itself, as in panda-gym:
         multibodies, each a box or a cylinder. Otherwise the table, and every object whose kind does not ask for a
         multibody, are rigid bodies, and their shapes are such that what slides does not sink in
@@ -62,7 +62,7 @@ class Physics:
     delicate_substeps: int = 8
     delicate_iterations: int = 60
     sleeping: bool = True
-    margin: float = 0.005
+    contact_margin: float = 0.005
     stock_bodies: bool = False
 
     @property
@@ -79,7 +79,7 @@ PANDA_GYM_PHYSICS = Physics(
     delicate_substeps=20,
     delicate_iterations=50,
     sleeping=False,
-    margin=BULLET_MARGIN,
+    contact_margin=BULLET_MARGIN,
     stock_bodies=True,
 )
 
@@ -323,7 +323,7 @@ class Scene:
     def _set_delicate(self, delicate: bool) -> None:
         physics = self.physics
         self._delicate = delicate
-        self._margin = BULLET_MARGIN if delicate or not self.objects else physics.margin
+        self._margin = BULLET_MARGIN if delicate or not self.objects else physics.contact_margin
         substeps = physics.delicate_substeps if delicate else physics.substeps
         # Bullet divides seconds in each call to find how many steps it makes, which is exact for powers of two.
         self._set_steps(substeps // (substeps & -substeps), substeps & -substeps)
