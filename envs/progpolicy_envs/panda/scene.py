@@ -292,19 +292,17 @@ class Scene:
 
     def simulate(self) -> None:
         """Compute the physics of one control step."""
-        step, client = pybullet.stepSimulation, self.client
-        if self._margin == BULLET_MARGIN:
-            for _ in self._calls:
-                step(client)
-            return
+        step, set_engine, client = pybullet.stepSimulation, pybullet.setPhysicsEngineParameter, self.client
+        other_margin = self._margin != BULLET_MARGIN
         # Bullet keeps the margin in a variable of the whole process, so other worlds get theirs back at once.
-        set_engine = pybullet.setPhysicsEngineParameter
-        set_engine(contactBreakingThreshold=self._margin, physicsClientId=client)
+        if other_margin:
+            set_engine(contactBreakingThreshold=self._margin, physicsClientId=client)
         try:
             for _ in self._calls:
                 step(client)
         finally:
-            set_engine(contactBreakingThreshold=BULLET_MARGIN, physicsClientId=client)
+            if other_margin:
+                set_engine(contactBreakingThreshold=BULLET_MARGIN, physicsClientId=client)
 
     def take_over(self) -> None:
         """Read the state after the physics and let things that lie still fall asleep."""
