@@ -22,8 +22,8 @@ from rich.progress import track
 from study import RESULTS, train, write_results
 
 from sb3_progpolicy.evaluation import Evaluation, evaluate_program
+from sb3_progpolicy.programs import Program
 from sb3_progpolicy.programs.files import write_atomically
-from sb3_progpolicy.programs.syntax import Program
 
 SIZES, LONG_SIZES = range(1, 9), (9, 10)
 TRAINED_SIZES = range(1, 5)

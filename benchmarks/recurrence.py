@@ -16,7 +16,7 @@ import torch as th
 from rich.console import Console
 from rich.table import Table
 
-from sb3_progpolicy.programs.recurrence import scan
+from sb3_progpolicy.differentiable.recurrence import scan
 
 N_STEPS, N_SEQUENCES, N_INPUTS = 128, 16, 17
 HIDDEN_SIZES = (2, 6)

@@ -16,9 +16,10 @@ from typing import Any
 
 import torch as th
 
+from sb3_progpolicy.experiment.config import make_config
+from sb3_progpolicy.experiment.run import build_model
+from sb3_progpolicy.programs import Program
 from sb3_progpolicy.programs.files import write_atomically
-from sb3_progpolicy.programs.syntax import Program
-from sb3_progpolicy.training import build_model, make_config
 
 RESULTS = Path(__file__).parent / "results"
 _PACKAGES = ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy", "pybullet")

@@ -20,8 +20,9 @@ from rich.console import Console
 from rich.table import Table
 
 from sb3_progpolicy import ReptilePPO, evaluate_program
+from sb3_progpolicy.experiment.config import make_config
+from sb3_progpolicy.experiment.run import build_model
 from sb3_progpolicy.programs import Program, ProgramRunner, export_text, join_inputs, plot_program
-from sb3_progpolicy.training import build_model, make_config
 
 ENV = "Hanoi-v0"
 TRAINED_ON = 4

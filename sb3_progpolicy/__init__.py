@@ -6,15 +6,16 @@ from typing import TYPE_CHECKING, Any
 import progpolicy_envs  # registers the environments
 
 if TYPE_CHECKING:
-    from sb3_progpolicy.checkpoint import ReptileCheckpoint
     from sb3_progpolicy.evaluation import Evaluation, evaluate_model, evaluate_program
+    from sb3_progpolicy.extraction import extract_program, holds_program
     from sb3_progpolicy.grouped import GroupedSubprocVecEnv, GroupedVecEnv
     from sb3_progpolicy.interaction import InteractionHistory, VecInteractionHistory
     from sb3_progpolicy.policies import ProgrammaticPolicy, RecurrentProgrammaticPolicy
     from sb3_progpolicy.pretrained import load_pretrained, pretrained_names
-    from sb3_progpolicy.reptile import ReptileWrapper
+    from sb3_progpolicy.reptile.callback import ReptileWrapper
+    from sb3_progpolicy.reptile.checkpoint import ReptileCheckpoint
+    from sb3_progpolicy.reptile.tasks import RemakeOnVariation, TaskDistribution
     from sb3_progpolicy.reptile_ppo import ReptilePPO
-    from sb3_progpolicy.tasks import RemakeOnVariation, TaskDistribution
     from sb3_progpolicy.vec_env import BatchedVecEnv, make_fast_vec_env
 
 # Modules are imported when a name is first used: reading and running a program needs no torch.
@@ -26,14 +27,16 @@ _MODULES = {
     "InteractionHistory": "interaction",
     "ProgrammaticPolicy": "policies",
     "RecurrentProgrammaticPolicy": "policies",
-    "RemakeOnVariation": "tasks",
-    "ReptileCheckpoint": "checkpoint",
+    "RemakeOnVariation": "reptile",
+    "ReptileCheckpoint": "reptile",
     "ReptilePPO": "reptile_ppo",
     "ReptileWrapper": "reptile",
-    "TaskDistribution": "tasks",
+    "TaskDistribution": "reptile",
     "VecInteractionHistory": "interaction",
     "evaluate_model": "evaluation",
     "evaluate_program": "evaluation",
+    "extract_program": "extraction",
+    "holds_program": "extraction",
     "load_pretrained": "pretrained",
     "make_fast_vec_env": "vec_env",
     "pretrained_names": "pretrained",
@@ -55,6 +58,8 @@ __all__ = [
     "VecInteractionHistory",
     "evaluate_model",
     "evaluate_program",
+    "extract_program",
+    "holds_program",
     "load_pretrained",
     "make_fast_vec_env",
     "pretrained_names",

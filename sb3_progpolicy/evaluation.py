@@ -15,10 +15,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from progpolicy_envs import DOMAINS
-from sb3_progpolicy.interaction import VecInteractionHistory, action_spec, interaction_space
+from sb3_progpolicy.interaction import VecInteractionHistory
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.programs.interpreter import ProgramRunner, Semantics, join_inputs
-from sb3_progpolicy.programs.syntax import Program
+from sb3_progpolicy.programs.syntax import ProgramData
+from sb3_progpolicy.spaces import action_spec, interaction_space
 from sb3_progpolicy.vec_env import BatchedVecEnv, make_fast_vec_env
 
 Act = Callable[[NDArray[Any], NDArray[np.float32], NDArray[np.bool_]], NDArray[Any]]
@@ -58,7 +59,7 @@ class Evaluation:
 
 
 def evaluate_program(
-    program: Program,
+    program: ProgramData,
     env_id: str | None = None,
     variations: Sequence[Mapping[str, Any]] = ({},),
     n_episodes: int = 1,
@@ -172,7 +173,7 @@ def _evaluate(
         raise ValueError(f"max_steps={max_steps} is not accepted; {env_id} needs a cap on steps of at least 1")
     rows: list[Evaluation] = []
     domain = DOMAINS.get(env_id.rpartition(":")[2])
-    # In a batch those that have finished go on until the last has, which is dear where a step is a simulation.
+    # In a batch those that have finished go on until the last has, which is expensive where a step is a simulation.
     batched = spec.vector_entry_point is not None and not (domain is not None and domain.simulation)
     for group in _groups(variations, batched):
         first = len(rows)

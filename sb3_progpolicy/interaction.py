@@ -6,84 +6,20 @@ from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, is_vecenv_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+from typing_extensions import deprecated
 
-from sb3_progpolicy.programs.syntax import ActionSpec
-
-
-def action_spec(space: spaces.Space[Any]) -> ActionSpec:
-    """Describe an action space as plain data.
-
-    :param space: Discrete, Box, MultiDiscrete or MultiBinary
-    :raises ValueError: for any other space
-    """
-    if isinstance(space, spaces.Discrete):
-        return ActionSpec("discrete", (int(space.n),), start=int(space.start))
-    if isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim == 1 and not space.start.any():
-        return ActionSpec("multi_discrete", tuple(int(n) for n in space.nvec))
-    if isinstance(space, spaces.MultiBinary) and isinstance(space.n, (int, np.integer)):
-        return ActionSpec("multi_binary", (int(space.n),))
-    if isinstance(space, spaces.Box):
-        low, high = (tuple(bound.astype(float).ravel().tolist()) for bound in (space.low, space.high))
-        return ActionSpec("box", (len(low),), low=low, high=high)
-    raise ValueError(
-        f"action space {space} is not accepted; programs act in Discrete, Box and one-dimensional MultiDiscrete "
-        "(starting at 0) and MultiBinary spaces"
-    )
-
-
-def encode_actions(actions: NDArray[Any], spec: ActionSpec) -> NDArray[np.float32]:
-    """Encode actions for the input X: one-hot for Discrete and MultiDiscrete, the numbers themselves otherwise.
-
-    :param actions: ``(n_envs, *action_shape)``
-    :param spec: the action space
-    :return: ``(n_envs, spec.history_size)``
-    """
-    n_envs = len(actions)
-    if spec.kind in ("box", "multi_binary"):
-        return actions.reshape(n_envs, -1).astype(np.float32)
-    encoded = np.zeros((n_envs, spec.history_size), dtype=np.float32)
-    columns = actions.reshape(n_envs, -1) - spec.start
-    if len(spec.sizes) > 1:
-        columns = columns + np.concatenate(([0], np.cumsum(spec.sizes)[:-1]))
-    encoded[np.arange(n_envs)[:, None], columns] = 1
-    return encoded
-
-
-def interaction_space(observation_space: spaces.Space[Any], spec: ActionSpec) -> spaces.Box:
-    """Return the space of X = [observation, previous action, previous reward, previous done].
-
-    :param observation_space: a one-dimensional Box
-    :param spec: the action space
-    :raises ValueError: for any other observation space; ``gymnasium.wrappers.FlattenObservation`` makes it fit
-    """
-    if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
-        raise ValueError(
-            f"observation space {observation_space} is not accepted; programs read one-dimensional Box observations. "
-            "Wrap the environment in gymnasium.wrappers.FlattenObservation"
-        )
-    if spec.kind == "box":
-        low, high = (np.asarray(bound, dtype=np.float32) for bound in (spec.low, spec.high))
-    else:
-        low, high = np.zeros(spec.history_size, np.float32), np.ones(spec.history_size, np.float32)
-    unbounded = np.finfo(np.float32).max
-    # An untaken action is all zeros, whatever the bounds.
-    return spaces.Box(
-        np.concatenate((observation_space.low, np.minimum(low, 0), [-unbounded, 0])).astype(np.float32),
-        np.concatenate((observation_space.high, np.maximum(high, 0), [unbounded, 1])).astype(np.float32),
-        dtype=np.float32,
-    )
+from sb3_progpolicy.spaces import action_spec, encode_actions, interaction_space
 
 
 class InteractionHistory(gym.ObservationWrapper[NDArray[np.float32], Any, Any], gym.utils.RecordConstructorArgs):
     """Append the previous action, reward and done flag to the observation of one environment (section 2.4).
 
     They survive the end of an episode: the first observation of the next one shows the last action and reward and a
-    done flag of 1. They are zero before the first action, after :meth:`forget`, and after a reset with a seed or a
-    variation.
+    done flag of 1. They are zero before the first action, after :meth:`reset_history`, and after a reset with a seed
+    or a variation.
 
     :param env: an environment with one-dimensional Box observations
     :raises ValueError: if a space is not accepted
@@ -94,18 +30,23 @@ class InteractionHistory(gym.ObservationWrapper[NDArray[np.float32], Any, Any], 
         gym.ObservationWrapper.__init__(self, env)
         self.spec_of_actions = action_spec(env.action_space)
         self.observation_space = interaction_space(env.observation_space, self.spec_of_actions)  # type: ignore[assignment]
-        self.forget()
+        self.reset_history()
 
-    def forget(self) -> None:
+    def reset_history(self) -> None:
         """Zero the history, as at the start of a task."""
-        self._history = np.zeros(self.spec_of_actions.history_size + 2, dtype=np.float32)
+        self._history = np.zeros(self.spec_of_actions.interaction_size, dtype=np.float32)
+
+    @deprecated("InteractionHistory.forget is now called reset_history")
+    def forget(self) -> None:
+        """The former name of :meth:`reset_history`."""
+        self.reset_history()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Start an episode; given ``seed`` or ``options``, a new task too, which zeroes the history."""
         if options or seed is not None:
-            self.forget()
+            self.reset_history()
         return super().reset(seed=seed, options=options)
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], Any, bool, bool, dict[str, Any]]:
@@ -137,7 +78,7 @@ class VecInteractionHistory(VecEnvWrapper):
     def reset(self) -> NDArray[np.float32]:
         """Start a task in every environment: the history is zero."""
         observations = cast(NDArray[Any], self.venv.reset())
-        zeros = np.zeros((self.num_envs, self.spec_of_actions.history_size + 2), dtype=np.float32)
+        zeros = np.zeros((self.num_envs, self.spec_of_actions.interaction_size), dtype=np.float32)
         return np.concatenate((observations, zeros), axis=1, dtype=np.float32)
 
     def step_async(self, actions: NDArray[Any]) -> None:
@@ -173,7 +114,7 @@ def program_names(venv: VecEnv) -> tuple[tuple[str, ...], tuple[str, ...]]:
     :return: one name per number of X, one per controller output
     """
     spec = action_spec(venv.action_space)
-    history = spec.history_size + 2 if is_vecenv_wrapped(venv, VecInteractionHistory) else 0
+    history = spec.interaction_size if is_vecenv_wrapped(venv, VecInteractionHistory) else 0
     n_observations = int(np.prod(venv.observation_space.shape or (0,))) - history
     observations, actions = (
         tuple(venv.get_attr(attribute)[0]) if venv.has_attr(attribute) else ()

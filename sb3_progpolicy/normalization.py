@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
-from sb3_progpolicy.programs.modules import ProgramModule
+from sb3_progpolicy.differentiable.module import ProgramModule
 
 EPSILON = 1e-8
 CLIP_REWARD = 10.0  # as VecNormalize's; until the statistics have settled, a scaled reward can be anything
@@ -98,6 +98,6 @@ class RewardScaler:
         scaled = rewards / np.sqrt(self.statistics.var + EPSILON)
         return np.clip(scaled, -CLIP_REWARD, CLIP_REWARD).astype(np.float32)
 
-    def forget_returns(self) -> None:
+    def reset_returns(self) -> None:
         """Start the running returns anew, as at a task switch; the statistics stay."""
         self._returns = np.zeros(0)

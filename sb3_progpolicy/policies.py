@@ -20,10 +20,11 @@ from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
-from sb3_progpolicy.interaction import action_spec
+from sb3_progpolicy.differentiable.module import Conditions, ProgramModule, State
 from sb3_progpolicy.normalization import NormalizingExtractor
-from sb3_progpolicy.programs.modules import Conditions, ProgramModule, State
-from sb3_progpolicy.programs.syntax import ActionSpec, Cell, Program
+from sb3_progpolicy.programs.program import Program
+from sb3_progpolicy.programs.syntax import Cell
+from sb3_progpolicy.spaces import ActionSpec, action_spec, check_observation_space
 
 # W is one number per layer and has few updates to decide in, so that it takes larger steps than the controllers.
 DERIVATION_LR_SCALE = 10.0
@@ -85,11 +86,7 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
         reset_state_at_episode_start: bool = False,
         **kwargs: Any,
     ) -> None:
-        if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
-            raise ValueError(
-                f"observation space {observation_space} is not accepted; programs read one-dimensional Box "
-                "observations. Wrap the environment in gymnasium.wrappers.FlattenObservation"
-            )
+        check_observation_space(observation_space)
         if temperature <= 0:
             raise ValueError(f"temperature={temperature} is not accepted; it is above 0")
         if kwargs.pop("use_sde", False):
@@ -186,7 +183,7 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
         if isinstance(self.features_extractor, NormalizingExtractor):
             self.features_extractor.fold_into(module)
         n_inputs = self.module.n_inputs
-        history = self.spec_of_actions.history_size + 2
+        history = self.spec_of_actions.interaction_size
         return Program(
             body=module.to_syntax(),
             n_observations=n_inputs - history if interaction else n_inputs,
@@ -198,9 +195,9 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
             metadata=metadata,
         )
 
-    def _distribution(self, features: th.Tensor, tests: th.Tensor) -> Distribution:
+    def _distribution(self, features: th.Tensor, condition_values: th.Tensor) -> Distribution:
         """Return the action distribution of the soft semantics."""
-        return self._distribution_of(self.module.mix(features, self.module.masses(tests)))
+        return self._distribution_of(self.module.mix(features, self.module.mixture_weights(condition_values)))
 
     def _distribution_of(self, parameters: th.Tensor) -> Distribution:
         """Return the distribution with these parameters, ``(n, n_outputs)`` (see ``ProgramModule.mix``)."""
@@ -216,13 +213,13 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
             distribution.proba_distribution(action_logits=parameters)
         return distribution
 
-    def derivation_terms(self, obs: th.Tensor, tests: th.Tensor) -> th.Tensor:
+    def derivation_terms(self, obs: th.Tensor, condition_values: th.Tensor) -> th.Tensor:
         """Return what :meth:`evaluate_derivation` needs, which stays the same while only W is moved.
 
         :param obs: ``(n, n_inputs)``
-        :param tests: the values of B, ``(n, depth - 1)``
+        :param condition_values: the values of B, ``(n, depth - 1)``
         """
-        return self.module.derivation_terms(self._split_features(obs)[0], tests)
+        return self.module.derivation_terms(self._split_features(obs)[0], condition_values)
 
     def evaluate_derivation(self, terms: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor | None]:
         """Return log-probabilities and entropies.
@@ -233,15 +230,17 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
         distribution = self._distribution_of(self.module.mix_derivation(terms))
         return distribution.log_prob(actions), distribution.entropy()
 
-    def evaluate_tests(self, obs: th.Tensor, tests: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def evaluate_condition_values(
+        self, obs: th.Tensor, condition_values: th.Tensor, actions: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
         """Return values and log-probabilities for conditions whose values are known.
 
         :param obs: ``(n, n_inputs)``
-        :param tests: the values of B, ``(n, depth - 1)``
+        :param condition_values: the values of B, ``(n, depth - 1)``
         :param actions: ``(n,)`` or ``(n, ...)``
         """
         features, critic_features = self._split_features(obs)
-        return self._values(critic_features), self._distribution(features, tests).log_prob(actions)
+        return self._values(critic_features), self._distribution(features, condition_values).log_prob(actions)
 
     def condition_values(self, obs: th.Tensor, states: tuple[th.Tensor, ...] | None = None) -> th.Tensor:
         """Return the value of B of every condition, ``(n, depth - 1)``.
@@ -250,9 +249,11 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
         :param states: of recurrent conditions at the start of the sequences
         """
         features, _ = self._split_features(obs)
-        return self._tests(features, states or self.module.initial_state(1), features.new_zeros(len(features)))[0]
+        return self._condition_values(
+            features, states or self.module.initial_state(1), features.new_zeros(len(features))
+        )[0]
 
-    def _tests(
+    def _condition_values(
         self, features: th.Tensor, states: tuple[th.Tensor, ...], episode_starts: th.Tensor
     ) -> tuple[th.Tensor, State]:
         """Return the values of B and the new states; affine conditions have none."""
@@ -285,7 +286,7 @@ class RecurrentProgrammaticPolicy(ProgrammaticActorCritic, RecurrentActorCriticP
         """The conditions, under the name by which ``RecurrentPPO`` asks for the size of the state."""
         return self.module.conditions
 
-    def _tests(
+    def _condition_values(
         self, features: th.Tensor, states: tuple[th.Tensor, ...], episode_starts: th.Tensor
     ) -> tuple[th.Tensor, State]:
         """Run the conditions over sequences laid out one after the other, as RecurrentPPO's batches are."""
@@ -307,8 +308,8 @@ class RecurrentProgrammaticPolicy(ProgrammaticActorCritic, RecurrentActorCriticP
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor, RNNStates]:
         """Return actions, values, log-probabilities and new states. See ``RecurrentActorCriticPolicy.forward``."""
         pi_features, vf_features = self._split_features(obs)
-        tests, states = self._tests(pi_features, lstm_states.pi, episode_starts)
-        distribution = self._distribution(pi_features, tests)
+        condition_values, states = self._condition_values(pi_features, lstm_states.pi, episode_starts)
+        distribution = self._distribution(pi_features, condition_values)
         actions = distribution.get_actions(deterministic=deterministic)
         log_prob = distribution.log_prob(actions)
         actions = actions.reshape((-1, *self.action_space.shape))  # type: ignore[misc]
@@ -319,8 +320,8 @@ class RecurrentProgrammaticPolicy(ProgrammaticActorCritic, RecurrentActorCriticP
     ) -> tuple[Distribution, tuple[th.Tensor, ...]]:
         """Return the action distribution and new states. See ``RecurrentActorCriticPolicy.get_distribution``."""
         features, _ = self._split_features(obs)
-        tests, states = self._tests(features, lstm_states, episode_starts)
-        return self._distribution(features, tests), states
+        condition_values, states = self._condition_values(features, lstm_states, episode_starts)
+        return self._distribution(features, condition_values), states
 
     def predict_values(  # type: ignore[override]
         self,
@@ -336,8 +337,8 @@ class RecurrentProgrammaticPolicy(ProgrammaticActorCritic, RecurrentActorCriticP
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
         """Return values, log-probabilities and entropies. See ``RecurrentActorCriticPolicy.evaluate_actions``."""
         pi_features, vf_features = self._split_features(obs)
-        tests, _ = self._tests(pi_features, lstm_states.pi, episode_starts)
-        distribution = self._distribution(pi_features, tests)
+        condition_values, _ = self._condition_values(pi_features, lstm_states.pi, episode_starts)
+        distribution = self._distribution(pi_features, condition_values)
         # RecurrentPPO hands MultiBinary actions over as int8, which a Bernoulli distribution does not take.
         return self._values(vf_features), distribution.log_prob(actions.float()), distribution.entropy()
 

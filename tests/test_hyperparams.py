@@ -1,10 +1,12 @@
 import pytest
 
+from sb3_progpolicy.experiment.config import make_config
+from sb3_progpolicy.experiment.methods import METHODS
+from sb3_progpolicy.experiment.run import build_model
 from sb3_progpolicy.hyperparams import algorithms, load_hyperparams, parse_kwargs, parse_value
-from sb3_progpolicy.training import ALGORITHMS, build_model, make_config
 
 
-@pytest.mark.parametrize("algo", list(ALGORITHMS))
+@pytest.mark.parametrize("algo", list(METHODS))
 @pytest.mark.parametrize("env_id", ["Hanoi-v0", "CartPole-v1"])
 def test_shipped_hyperparameters_build_a_model(algo, env_id):
     config = make_config(algo, env_id, seed=0)
@@ -14,7 +16,7 @@ def test_shipped_hyperparameters_build_a_model(algo, env_id):
 
 
 def test_there_is_a_file_for_every_algorithm():
-    assert set(algorithms()) == set(ALGORITHMS)
+    assert set(algorithms()) == {method.hyperparams for method in METHODS.values()}
 
 
 def test_entry_of_an_environment_starts_from_the_default_one():

@@ -8,7 +8,8 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_progpolicy import InteractionHistory, VecInteractionHistory
-from sb3_progpolicy.interaction import action_spec, encode_actions, program_names
+from sb3_progpolicy.interaction import program_names
+from sb3_progpolicy.spaces import action_spec, encode_actions
 
 ACTION_SPACES = {
     "discrete": spaces.Discrete(3, start=-1),

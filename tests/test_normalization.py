@@ -8,7 +8,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_progpolicy.normalization import NormalizingExtractor, RewardScaler
-from tests.programs.test_modules import CELLS, N_INPUTS, N_SEQUENCES, make_module, parameters_of
+from tests.differentiable.test_module import CELLS, N_INPUTS, N_SEQUENCES, make_module, parameters_of
 
 
 def make_extractor(n_features=N_INPUTS, n_batches=3):
@@ -80,7 +80,7 @@ def test_a_new_task_starts_new_returns_and_keeps_the_statistics():
     for _ in range(20):
         scaler(np.array([1.0, 5.0]), np.zeros(2, bool))
     variance, count = float(scaler.statistics.var), scaler.statistics.count
-    scaler.forget_returns()
+    scaler.reset_returns()
     assert float(scaler.statistics.var) == variance
     scaler(np.array([1.0]), np.zeros(1, bool))
     np.testing.assert_allclose(scaler._returns, [1.0])

@@ -135,8 +135,8 @@ def test_gradients_flow_through_time_where_states_are_zeroed_at_episode_starts(c
     policy = make(RecurrentPPO, RecurrentProgrammaticPolicy, "CartPole-v1", policy_kwargs=kwargs).policy
     features = th.randn(6, 4, requires_grad=True)
     zero = th.zeros(1, 1, policy.module.conditions.hidden_size)
-    tests, _ = policy._tests(features, (zero, zero), th.tensor([1.0, 0, 0, 1.0, 0, 0]))
-    tests[-1].sum().backward()
+    values, _ = policy._condition_values(features, (zero, zero), th.tensor([1.0, 0, 0, 1.0, 0, 0]))
+    values[-1].sum().backward()
     reached = features.grad.abs().sum(1) > 0
     assert reached.tolist() == [False] * 3 + [True] * 3
 

@@ -1,5 +1,7 @@
 """Reptile with stock algorithms: the update, its schedule, and what a task switch does."""
 
+import itertools
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -45,32 +47,25 @@ def flat(model):
 
 
 class Record(ReptileWrapper):
-    """Keeps theta, theta_hat, beta and the new theta of every meta-step."""
+    """Keeps theta, theta_hat, beta, the new theta and the length of every meta-step."""
 
     def _on_training_start(self):
         super()._on_training_start()
         self.records = []
 
-    def _meta_step(self, beta):
-        theta = th.cat([parameter.flatten() for parameter in self._theta])
-        theta_hat = flat(self.model)
-        norm = super()._meta_step(beta)
+    def _meta_step(self):
+        theta, theta_hat = th.cat([parameter.flatten() for parameter in self._theta]), flat(self.model)
+        super()._meta_step()
+        logged = (self.logger.name_to_value[f"reptile/{name}"] for name in ("meta_learning_rate", "meta_step_norm"))
+        beta, norm = logged
         self.records.append((theta, theta_hat, beta, flat(self.model), norm))
-        return norm
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "policy"), [(PPO, "MlpPolicy"), (RecurrentPPO, "MlpLstmPolicy"), (ReptilePPO, "ProgPolicy")]
-)
+@pytest.mark.parametrize(("algorithm", "policy"), [(PPO, "MlpPolicy"), (RecurrentPPO, "MlpLstmPolicy")])
 def test_meta_step_goes_from_theta_towards_theta_hat(algorithm, policy):
-    kwargs = {"interaction_history": False} if algorithm is ReptilePPO else {}
-    model = make(algorithm, policy, **kwargs)
+    model = make(algorithm, policy)
     reptile = Record(by_attribute(), inner_updates=2, meta_learning_rate=0.25)
-    if algorithm is ReptilePPO:
-        model.reptile = reptile
-        model.learn(96)
-    else:
-        model.learn(96, callback=reptile)
+    model.learn(96, callback=reptile)
     assert len(reptile.records) == reptile.meta_iteration == 3
     for theta, theta_hat, beta, new, norm in reptile.records:
         assert beta == 0.25
@@ -78,9 +73,27 @@ def test_meta_step_goes_from_theta_towards_theta_hat(algorithm, policy):
         th.testing.assert_close(new, theta + 0.25 * (theta_hat - theta))
         assert norm == pytest.approx(float((new - theta).norm()), rel=1e-4)
     # Each task starts where the meta-step led.
-    for before, after in zip(reptile.records, reptile.records[1:], strict=False):
+    for before, after in itertools.pairwise(reptile.records):
         th.testing.assert_close(after[0], before[3], rtol=0, atol=0)
     th.testing.assert_close(flat(model), reptile.records[-1][3], rtol=0, atol=0)
+
+
+def test_callback_of_one_model_trains_a_second_one_afresh():
+    def trained(reptile):
+        model = make()
+        model.learn(64, callback=reptile)
+        return flat(model)
+
+    used = ReptileWrapper(by_attribute(), 1, meta_learning_rate=0.02, meta_optimizer="adam")
+    first, second = trained(used), trained(used)
+    th.testing.assert_close(second, first, rtol=0, atol=0)
+    assert (first - flat(make())).norm() > 1e-3
+
+
+def test_algorithm_with_reptile_built_in_is_refused():
+    model = ReptilePPO("MlpPolicy", make_vec_env("CartPole-v1", 2), n_steps=8, batch_size=8)
+    with pytest.raises(TypeError, match="has Reptile built in"):
+        model.learn(32, callback=ReptileWrapper(by_attribute()))
 
 
 def test_adam_steps_on_the_pseudo_gradient():

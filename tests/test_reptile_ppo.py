@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_progpolicy import InteractionHistory, ReptilePPO, VecInteractionHistory
 from sb3_progpolicy.programs import ProgramRunner
+from sb3_progpolicy.reptile_ppo.rollout import PolicyActor
 from sb3_progpolicy.vec_env import make_fast_vec_env
 
 POLICIES = ("ProgPolicy", "PRLPolicy", "MlpPolicy", "MlpLstmPolicy")
@@ -79,7 +80,7 @@ def test_hidden_state_survives_episode_end_but_not_task_switch(policy):
 
         def _on_step(self):
             assert self.locals["dones"].all()
-            after_step.append(self.model._present_states().pi[0].clone())
+            after_step.append(self.model._actor.states.pi[0].clone())
             return True
 
     model.learn(64, callback=Watch())
@@ -94,7 +95,7 @@ def test_hidden_state_survives_episode_end_but_not_task_switch(policy):
 def log_ratios(model):
     """Of all the transitions in the first epoch, before any parameter has moved."""
     captured = []
-    evaluate = model._evaluate
+    evaluate = model.adapter.evaluate
 
     def watched(batch):
         values, log_prob, entropy = evaluate(batch)
@@ -104,15 +105,9 @@ def log_ratios(model):
         return values, log_prob, entropy
 
     model.learning_rate, model.lr_schedule = 0.0, lambda _: 0.0
-    original = model.train
-
-    def train():
-        model._evaluate = watched
-        original()
-        model._evaluate = evaluate
-
-    model.train = train
+    model.adapter.evaluate = watched
     model.learn(2 * model.n_steps * model.n_envs)
+    del model.adapter.evaluate
     return captured
 
 
@@ -171,7 +166,7 @@ def test_policies_train_without_the_sampler(policy, cell, space):
     for ratio, values in log_ratios(model):
         assert ratio.abs().max() < 1e-5
         assert values.abs().max() < 1e-4
-    assert model._sampler is None
+    assert isinstance(model._actor, PolicyActor)
     before = weights(model)
     model.lr_schedule = lambda _: 0.01
     model.learn(model.n_steps * model.n_envs * 2)
@@ -253,10 +248,10 @@ def test_price_on_length_adds_the_expected_number_of_conditions_to_the_loss():
     model = make(learning_rate=0.0).learn(64)
     with th.no_grad():
         model.search.logits.copy_(th.tensor([[0.0, 1.0], [0.5, 0.0]]))
-    rollout, gradients, losses = model._sequences(), [], []
+    rollout, gradients, losses = model.rollout_buffer.sequences(model.sequence_length), [], []
     for length_coef in (0.0, 0.7):
         model.length_coef = length_coef
-        loss, _ = model._loss(rollout, np.arange(4), 0.2)
+        loss, _ = model.loss(rollout, 0.2)
         losses.append(loss.item())
         gradients.append(th.autograd.grad(loss, model.search.logits)[0])
     price = 0.7 * model.search.expected_conditions()
@@ -395,7 +390,7 @@ def test_saved_and_loaded_model_is_the_same_and_trains_on(policy, tmp_path):
     loaded = ReptilePPO.load(tmp_path / "folder" / "model", "Hanoi-v0")
     assert th.equal(weights(loaded), weights(model))
     assert loaded.reward_scaler.statistics.var == model.reward_scaler.statistics.var
-    assert loaded.reptile.meta_iteration == model.reptile.meta_iteration > 0
+    assert loaded.meta_iteration == model.meta_iteration > 0
     assert loaded.n_envs == model.n_envs
     observation = np.ones((4, 17), np.float32)
     np.testing.assert_array_equal(

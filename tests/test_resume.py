@@ -76,7 +76,7 @@ def tensors(value, place=""):
 
 def assert_same_bits(expected, actual):
     assert set(expected) == set(actual)
-    assert any("meta_optimizer" in name and "exp_avg" in name for name in expected)
+    assert any("outer_optimizer" in name and "exp_avg" in name for name in expected)
     for name, value in expected.items():
         same = th.equal(value, actual[name]) if isinstance(value, th.Tensor) else value == actual[name]
         assert same, name

@@ -8,7 +8,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from progpolicy_envs import DOMAINS
 from sb3_progpolicy import TaskDistribution
-from sb3_progpolicy.tasks import CurriculumSampler, FailureSampler, RemakeOnVariation, default_tasks
+from sb3_progpolicy.reptile.tasks import CurriculumSampler, FailureSampler, RemakeOnVariation, default_tasks
 from sb3_progpolicy.vec_env import make_fast_vec_env
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import typer
 
-from sb3_progpolicy.cli import evaluating, playing, rendering, showing, training
+from sb3_progpolicy.cli import evaluate, playing, rendering, show, train
 from sb3_progpolicy.cli.parsing import repeat_flags
 from sb3_progpolicy.nearest import unknown
 
@@ -19,12 +19,12 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 COMMANDS: dict[str, Callable[..., None]] = {
-    "train": training.train,
-    "evaluate": evaluating.evaluate,
-    "show": showing.show,
+    "train": train.train,
+    "evaluate": evaluate.evaluate,
+    "show": show.show,
     "render": rendering.render,
     "play": playing.play,
-    "envs": showing.envs,
+    "envs": show.envs,
 }
 for _name, _command in COMMANDS.items():
     app.command(_name)(_command)

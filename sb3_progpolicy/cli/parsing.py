@@ -1,23 +1,15 @@
-"""What the command line's arguments mean: variations, key:value pairs, and names of runs and programs."""
+"""What the command line's arguments mean: variations and key:value pairs."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from progpolicy_envs import DOMAINS
 from sb3_progpolicy.hyperparams import parse_kwargs, parse_value
-from sb3_progpolicy.nearest import unknown
-from sb3_progpolicy.pretrained import load_pretrained, pretrained_names
-from sb3_progpolicy.programs.io import load_program
-from sb3_progpolicy.programs.syntax import Program
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 # Flags that, as in the zoo, take several values: `--hyperparams n_steps:64 gamma:0.9`.
 _MANY = {"--hyperparams": ":", "-params": ":", "--env-kwargs": ":", "--set": "="}
@@ -105,79 +97,3 @@ def default_variations(env_id: str) -> list[dict[str, Any]]:
         return [{}]
     sizes = [{domain.size: size} for size in dict.fromkeys(variation[domain.size] for variation in domain.train)]
     return [*sizes, *domain.unseen]
-
-
-@dataclass(frozen=True)
-class Source:
-    """What a name on the command line stands for.
-
-    :param name: as given
-    :param env_id: environment it was trained in, if known
-    :param program: if it is one
-    :param model: if it is not a program
-    :param env_kwargs: constructor arguments that it was trained with
-    """
-
-    name: str
-    env_id: str | None
-    program: Program | None
-    model: OnPolicyAlgorithm | None
-    env_kwargs: dict[str, Any]
-
-
-def find_source(name: str) -> Source:
-    """Load a run folder, a program's ``.json``, a model's ``.zip`` or a pretrained program, in this order.
-
-    :param name: a path or a name
-    :raises ValueError: if there is nothing of that name; the message names the nearest pretrained programs
-    """
-    path = Path(name)
-    if path.is_dir():
-        return _from_run(path)
-    if path.is_file() and path.suffix == ".json":
-        return _from_program(name, load_program(path))
-    if path.is_file() and path.suffix == ".zip":
-        return _from_model(path)
-    if path.suffix in (".json", ".zip") or path.is_file():
-        reason = "is neither a .json nor a .zip file" if path.is_file() else "does not exist"
-        raise ValueError(f"{name} {reason}; give a run folder, a program (.json), a model (.zip) or a pretrained name")
-    if name.rpartition(":")[2] in pretrained_names():
-        return _from_program(name, load_pretrained(name))
-    raise unknown("run, file or pretrained program", name, pretrained_names())
-
-
-def _from_program(name: str, program: Program, env_kwargs: dict[str, Any] | None = None) -> Source:
-    env_id = program.metadata.get("env")
-    if env_id is not None and not isinstance(env_id, str):
-        raise ValueError(f"{name}: metadata: env={env_id!r} is not accepted; it is an environment id")
-    return Source(name, env_id, program, None, env_kwargs or {})
-
-
-def _from_run(folder: Path) -> Source:
-    from sb3_progpolicy.training import MODEL, PROGRAM, read_config
-
-    config = read_config(folder)
-    if (folder / PROGRAM).is_file():
-        return _from_program(str(folder), load_program(folder / PROGRAM), dict(config.env_kwargs))
-    if not (folder / MODEL).is_file():
-        raise ValueError(f"{folder} holds no model yet")
-    return _from_model(folder / MODEL)
-
-
-def _from_model(path: Path) -> Source:
-    from sb3_progpolicy.policies import ProgrammaticActorCritic
-    from sb3_progpolicy.reptile_ppo import ReptilePPO
-    from sb3_progpolicy.training import CONFIG, load_model, read_config
-
-    config = read_config(path.parent) if (path.parent / CONFIG).is_file() else None
-    try:
-        model = load_model(path, device="cpu")
-    except ValueError:
-        raise
-    except Exception as error:  # unpickling a damaged file may raise anything
-        raise ValueError(f"{path} is not a model that can be loaded: {error}") from None
-    env_kwargs = dict(config.env_kwargs) if config else {}
-    if isinstance(model, ReptilePPO) and isinstance(model.policy, ProgrammaticActorCritic):
-        return _from_program(str(path), model.program(), env_kwargs)
-    env_id = config.env if config else getattr(model, "env_id", None)
-    return Source(str(path), env_id, None, model, env_kwargs)

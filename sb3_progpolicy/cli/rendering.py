@@ -10,8 +10,9 @@ from typing import Annotated, Any
 
 import typer
 
-from sb3_progpolicy.cli.parsing import Source, check_folder, default_variations, find_source, parse_variations
+from sb3_progpolicy.cli.parsing import check_folder, default_variations, parse_variations
 from sb3_progpolicy.cli.streams import quiet_stdout
+from sb3_progpolicy.experiment.sources import Source, find_source
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.programs.files import write_atomically
 

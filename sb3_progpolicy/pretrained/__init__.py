@@ -5,8 +5,7 @@ from __future__ import annotations
 from importlib.resources import as_file, files
 
 from sb3_progpolicy.nearest import unknown
-from sb3_progpolicy.programs.io import load_program
-from sb3_progpolicy.programs.syntax import Program
+from sb3_progpolicy.programs.program import Program, load_program
 
 
 def pretrained_names() -> list[str]:

@@ -1,5 +1,6 @@
 """Programs: the syntax as plain data, and everything that reads, runs, prints and saves it."""
 
+from sb3_progpolicy.programs import syntax as _syntax
 from sb3_progpolicy.programs.export import (
     export_graphviz,
     export_latex,
@@ -8,16 +9,19 @@ from sb3_progpolicy.programs.export import (
     plot_program,
 )
 from sb3_progpolicy.programs.interpreter import ProgramRunner, join_inputs
-from sb3_progpolicy.programs.io import ProgramFormatError, load_program, save_program
+from sb3_progpolicy.programs.io import ProgramFormatError, save_program
+from sb3_progpolicy.programs.program import Program, load_program
 from sb3_progpolicy.programs.syntax import (
-    ActionSpec,
     Condition,
     Controller,
     Expression,
     IfThenElse,
-    Program,
 )
 from sb3_progpolicy.programs.validation import check_program
+from sb3_progpolicy.spaces import ActionSpec
+
+# Where Program was in release 0.1; pickles name this place.
+_syntax.Program = Program  # type: ignore[attr-defined]
 
 __all__ = [
     "ActionSpec",

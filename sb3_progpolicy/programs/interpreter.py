@@ -12,16 +12,19 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from typing_extensions import deprecated
 
-from sb3_progpolicy.programs.syntax import GATES, ActionSpec, Condition, Program
+from sb3_progpolicy.programs.cells import STEPS, sigmoid
+from sb3_progpolicy.programs.syntax import Condition, ProgramData
 from sb3_progpolicy.programs.validation import check_program
+from sb3_progpolicy.spaces import ActionSpec, encode_actions
 
 Floats = NDArray[np.float64]
 Semantics = Literal["crisp", "soft"]
 
 
 def join_inputs(
-    program: Program,
+    program: ProgramData,
     observation: ArrayLike,
     previous_action: ArrayLike | None = None,
     previous_reward: ArrayLike = 0.0,
@@ -52,7 +55,8 @@ def join_inputs(
     inputs = np.zeros((n_envs, program.n_inputs))
     inputs[:, : program.n_observations] = observations
     if previous_action is not None:
-        inputs[:, program.n_observations : -2] = _encode_actions(program.action, previous_action, n_envs)
+        actions = _check_actions(program.action, previous_action, n_envs)
+        inputs[:, program.n_observations : -2] = encode_actions(actions, program.action, np.float64)
     for column, name, value in ((-2, "previous_reward", previous_reward), (-1, "previous_done", previous_done)):
         if np.shape(value) not in ((), (n_envs,)):
             raise ValueError(f"{name} has the shape {np.shape(value)}; ({n_envs},) or one value is accepted")
@@ -60,10 +64,9 @@ def join_inputs(
     return inputs
 
 
-def _encode_actions(action: ActionSpec, given: ArrayLike, n_envs: int) -> Floats:
-    width = (
-        1 if action.kind == "discrete" else len(action.sizes) if action.kind == "multi_discrete" else action.sizes[0]
-    )
+def _check_actions(action: ActionSpec, given: ArrayLike, n_envs: int) -> NDArray[Any]:
+    """Return actions ``(n_envs, width)`` that are in the action space; Box actions beyond their bounds are accepted."""
+    width = {"discrete": 1, "multi_discrete": len(action.sizes)}.get(action.kind, action.sizes[0])
     actions = np.asarray(given)
     if actions.size != n_envs * width:
         raise ValueError(
@@ -72,17 +75,15 @@ def _encode_actions(action: ActionSpec, given: ArrayLike, n_envs: int) -> Floats
         )
     actions = actions.reshape(n_envs, width)
     if action.kind in ("box", "multi_binary"):
-        return actions.astype(np.float64)
-    indices = actions.astype(np.int64) - action.start
-    if np.any(indices != actions - action.start) or np.any(indices < 0) or np.any(indices >= action.sizes):
+        return actions
+    numbers = actions.astype(np.int64)
+    indices = numbers - action.start
+    if np.any(numbers != actions) or np.any(indices < 0) or np.any(indices >= action.sizes):
         raise ValueError(
             f"previous_action={actions.tolist()} is not accepted; actions are whole numbers from {action.start}, "
             f"fewer than {list(action.sizes)} of them"
         )
-    encoded = np.zeros((n_envs, action.history_size))
-    first = np.cumsum((0, *action.sizes[:-1]))
-    encoded[np.arange(n_envs)[:, None], first + indices] = 1
-    return encoded
+    return numbers
 
 
 class ProgramRunner:
@@ -91,14 +92,14 @@ class ProgramRunner:
     :param program: what to run
     :param n_envs: number of rows of the inputs
     :param semantics: ``"crisp"`` runs a real if-then-else on ``B >= 0``; ``"soft"`` mixes the controllers with the
-        masses ``s_k * prod_{j<k}(1 - s_j)``, ``s = sigmoid(B / temperature)``, as in training
+        weights ``s_k * prod_{j<k}(1 - s_j)``, ``s = sigmoid(B / temperature)``, as in training
     :raises ValueError: if the program is not well formed or an argument is not accepted
 
     Conditions are numbered from the outermost inwards, and every one reads X at every step, reached or not: its
     memory must not depend on the branch taken. Memory is kept until :meth:`reset`, across ends of episodes.
     """
 
-    def __init__(self, program: Program, n_envs: int = 1, semantics: Semantics = "crisp") -> None:
+    def __init__(self, program: ProgramData, n_envs: int = 1, semantics: Semantics = "crisp") -> None:
         check_program(program)
         if semantics not in ("crisp", "soft"):
             raise ValueError(f"semantics={semantics!r} is not accepted; it is 'crisp' or 'soft'")
@@ -139,17 +140,23 @@ class ProgramRunner:
         return reached.argmax(axis=1)
 
     @property
-    def masses(self) -> Floats:
+    def mixture_weights(self) -> Floats:
         """Weight of every controller at the last step, ``(n_envs, n_controllers)``, summing to 1 for each row."""
         if self.semantics == "crisp":
             return np.eye(self._n_controllers)[self.branch]
-        masses, rest = np.empty((self.n_envs, self._n_controllers)), np.ones(self.n_envs)
+        weights, rest = np.empty((self.n_envs, self._n_controllers)), np.ones(self.n_envs)
         for index, value in enumerate(self._condition_values.T):
-            chosen = sigmoid(value / self.program.temperature)
-            masses[:, index] = rest * chosen
+            chosen = sigmoid(value / self.program.temperature, _tanh)
+            weights[:, index] = rest * chosen
             rest = rest * (1 - chosen)
-        masses[:, -1] = rest
-        return masses
+        weights[:, -1] = rest
+        return weights
+
+    @property
+    @deprecated("ProgramRunner.masses is now called mixture_weights")
+    def masses(self) -> Floats:
+        """The former name of :attr:`mixture_weights`."""
+        return self.mixture_weights
 
     def act(self, inputs: ArrayLike) -> NDArray[Any]:
         """Take one step.
@@ -176,7 +183,7 @@ class ProgramRunner:
             taken = outputs[np.arange(self.n_envs), self.branch]
             threshold = 0.0
         else:
-            taken = np.einsum("nk,nko->no", self.masses, _distribution(action, outputs))
+            taken = np.einsum("nk,nko->no", self.mixture_weights, _distribution(action, outputs))
             threshold = 0.5
         if action.kind == "box":
             return np.clip(taken, action.low, action.high).astype(np.float32)
@@ -195,13 +202,16 @@ class _Cell:
         if self.cell == "affine":
             self.rows = np.concatenate([self.readout_bias[None], self.readout])[None]
             return
-        constant, hidden = np.array(condition.bias_ih), np.array(condition.bias_hh)
-        # Only the GRU's candidate keeps its two biases apart: r scales W_hn h + b_hn and nothing else.
-        shared = slice(0, 2 * self.size) if self.cell == "gru" else slice(None)
-        constant[shared] += hidden[shared]
-        hidden[shared] = 0
+        constant, self.hidden_bias = np.array(condition.bias_ih), np.array(condition.bias_hh)
+        # Only the GRU's candidate keeps its recurrent part apart: r scales W_hn h + b_hn and nothing else.
+        apart = np.zeros(len(constant), dtype=bool)
+        if self.cell == "gru":
+            apart[2 * self.size :] = True
+        constant[~apart] += self.hidden_bias[~apart]
+        self.hidden_bias[~apart] = 0
+        columns = np.array(condition.weight_hh).T
+        self.joined_columns, self.apart_columns = list(np.where(apart, 0, columns)), list(np.where(apart, columns, 0))
         self.rows = np.column_stack([constant, np.array(condition.weight_ih).reshape(len(constant), -1)])
-        self.hidden_bias, self.hidden_columns = hidden, list(np.array(condition.weight_hh).T.copy())
 
     def reset(self) -> None:
         self.h = np.zeros((self.n_envs, self.size))
@@ -211,22 +221,9 @@ class _Cell:
         """Advance the state by the gates' share of X ``(n_envs, n_rows)`` and return B ``(n_envs,)``."""
         if self.cell == "affine":
             return gates[:, 0]
-        if self.cell == "gru":
-            both = _accumulate(gates[:, : -self.size], [column[: -self.size] for column in self.hidden_columns], self.h)
-            candidate = _accumulate(
-                self.hidden_bias[-self.size :], [column[-self.size :] for column in self.hidden_columns], self.h
-            )
-            r, z = np.split(sigmoid(both), 2, axis=1)
-            n = _tanh(gates[:, -self.size :] + r * candidate)
-            self.h = (1 - z) * n + z * self.h
-        else:
-            total = _accumulate(gates, self.hidden_columns, self.h)
-            if self.cell == "rnn":
-                self.h = _tanh(total)
-            else:
-                i, f, g, o = np.split(total, len(GATES["lstm"]), axis=1)
-                self.c = sigmoid(f) * self.c + sigmoid(i) * _tanh(g)
-                self.h = sigmoid(o) * _tanh(self.c)
+        joined = _accumulate(gates, self.joined_columns, self.h)
+        apart = _accumulate(self.hidden_bias, self.apart_columns, self.h)
+        self.h, self.c = STEPS[self.cell](joined, apart, self.h, self.c, _tanh)
         return _accumulate(self.readout_bias[None], list(self.readout[:, None]), self.h)[:, 0]
 
 
@@ -243,17 +240,12 @@ def _tanh(values: Floats) -> Floats:
     return np.array([math.tanh(value) for value in values.ravel().tolist()]).reshape(values.shape)
 
 
-def sigmoid(values: Floats) -> Floats:
-    """The logistic function, by way of tanh, which cannot overflow."""
-    return 0.5 + 0.5 * _tanh(0.5 * values)
-
-
 def _distribution(action: ActionSpec, outputs: Floats) -> Floats:
     """What the soft semantics mixes: probabilities of discrete actions, the outputs themselves for a Box."""
     if action.kind == "box":
         return outputs
     if action.kind == "multi_binary":
-        return sigmoid(outputs)
+        return sigmoid(outputs, _tanh)
     parts = []
     for part in np.split(outputs, np.cumsum(action.sizes)[:-1], axis=2):
         weights = np.exp(part - part.max(axis=2, keepdims=True))

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from sb3_progpolicy.programs.files import write_atomically
-from sb3_progpolicy.programs.syntax import ActionSpec, Condition, Controller, IfThenElse, Matrix, Program, Vector
+from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, Matrix, ProgramData, Vector
 from sb3_progpolicy.programs.validation import MAX_CONDITIONS, check_program
+from sb3_progpolicy.spaces import ActionSpec
 
 FORMAT, VERSION = "sb3-progpolicy program", 1
 MAX_BYTES = 8 * 1024 * 1024
@@ -25,7 +26,7 @@ class ProgramFormatError(ValueError):
     """A file is not a program in this format: damaged, truncated, of another version or hostile."""
 
 
-def save_program(program: Program, path: str | os.PathLike[str]) -> None:
+def save_program(program: ProgramData, path: str | os.PathLike[str]) -> None:
     """Write a program to a JSON file, atomically.
 
     :param program: what to save
@@ -40,17 +41,8 @@ def save_program(program: Program, path: str | os.PathLike[str]) -> None:
     write_atomically(path, text)
 
 
-def load_program(path: str | os.PathLike[str]) -> Program:
-    """Read a program written by :func:`save_program`, equal to the one saved.
-
-    The file may come from anyone: it is size-limited, parsed as plain JSON and checked field by field. Nothing in it
-    is run.
-
-    :param path: the file
-    :return: the program
-    :raises ProgramFormatError: naming the file and the fault, if it is not a well-formed program
-    :raises OSError: if the file cannot be read
-    """
+def read_program(path: str | os.PathLike[str]) -> ProgramData:
+    """Read and check a file; see :func:`~sb3_progpolicy.programs.load_program`."""
     try:
         with Path(path).open("rb") as handle:
             raw = handle.read(MAX_BYTES + 1)
@@ -63,7 +55,7 @@ def load_program(path: str | os.PathLike[str]) -> Program:
     return program
 
 
-def _to_json(program: Program) -> dict[str, Any]:
+def _to_json(program: ProgramData) -> dict[str, Any]:
     *then, last = program.controllers
     return {
         "format": FORMAT,
@@ -130,7 +122,7 @@ def _object_without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return result
 
 
-def _from_json(data: Any) -> Program:
+def _from_json(data: Any) -> ProgramData:
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise ValueError(f'it does not say "format": "{FORMAT}"')
     if type(data.get("version")) is not int or data["version"] != VERSION:
@@ -150,7 +142,7 @@ def _from_json(data: Any) -> Program:
         body = IfThenElse(_condition(f"{place}.if", branch["if"]), _controller(f"{place}.then", branch["then"]), body)
     if not isinstance(data["metadata"], dict):
         raise ValueError("metadata: an object is accepted, nothing else")
-    return Program(
+    return ProgramData(
         body=body,
         n_observations=data["n_observations"],
         action=_action(data["action"]),

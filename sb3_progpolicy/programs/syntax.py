@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
+
+from sb3_progpolicy.spaces import ActionSpec
 
 Vector = tuple[float, ...]
 Matrix = tuple[Vector, ...]
@@ -73,54 +74,10 @@ class IfThenElse:
 
 Expression = Controller | IfThenElse
 
-ActionKind = Literal["discrete", "box", "multi_discrete", "multi_binary"]
-
 
 @dataclass(frozen=True)
-class ActionSpec:
-    """The action space that a program acts in.
-
-    :param kind: which Gymnasium space
-    :param sizes: ``(n,)`` for Discrete, the ``nvec`` of a MultiDiscrete, ``(n,)`` for MultiBinary, the flat size of a
-        Box; a controller has ``sum(sizes)`` outputs
-    :param low: lower bounds of a Box, one per number; empty otherwise
-    :param high: upper bounds of a Box; empty otherwise
-    :param start: first action of a Discrete space
-    """
-
-    kind: ActionKind
-    sizes: tuple[int, ...]
-    low: Vector = ()
-    high: Vector = ()
-    start: int = 0
-
-    @property
-    def n_outputs(self) -> int:
-        """Number of outputs of every controller."""
-        return sum(self.sizes)
-
-    @property
-    def history_size(self) -> int:
-        """Width of the previous action in the input: one-hot for discrete spaces, the numbers themselves otherwise."""
-        return sum(self.sizes)
-
-
-@dataclass(frozen=True)
-class Program:
-    """A whole program, ready to be read, exported, saved or run.
-
-    The input vector X is the observation (``n_observations`` numbers) and, where ``interaction`` is set, the previous
-    action (``action.history_size`` numbers), the previous reward and the previous done flag (section 2.4).
-
-    :param body: the tree
-    :param n_observations: length of the observation
-    :param action: the action space
-    :param interaction: whether X goes on with the previous action, reward and done flag
-    :param input_names: one readable name per number of X
-    :param output_names: one readable name per controller output
-    :param temperature: temperature of the sigmoid in the soft semantics, above 0
-    :param metadata: where the program comes from (environment id, seed, steps ...); JSON values only
-    """
+class ProgramData:
+    """A whole program. :class:`~sb3_progpolicy.programs.Program` explains its fields, and prints and saves it."""
 
     body: Expression
     n_observations: int
@@ -149,25 +106,6 @@ class Program:
         if isinstance(last, IfThenElse):
             raise TypeError("a program ends in a controller")
         return (*(branch.then for branch in branches), last)
-
-    def __str__(self) -> str:
-        """The program as :func:`~sb3_progpolicy.programs.export.export_text` prints it."""
-        from sb3_progpolicy.programs.export import export_text
-
-        return export_text(self)
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the program to a JSON file, see :func:`~sb3_progpolicy.programs.io.save_program`."""
-        from sb3_progpolicy.programs.io import save_program
-
-        save_program(self, path)
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Program:
-        """Read a program from a JSON file, see :func:`~sb3_progpolicy.programs.io.load_program`."""
-        from sb3_progpolicy.programs.io import load_program
-
-        return load_program(path)
 
     def _branches(self) -> Iterator[IfThenElse]:
         expression = self.body

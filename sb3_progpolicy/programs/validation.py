@@ -6,7 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
-from sb3_progpolicy.programs.syntax import GATES, ActionKind, ActionSpec, Condition, Controller, IfThenElse, Program
+from sb3_progpolicy.programs.syntax import GATES, Condition, Controller, IfThenElse, ProgramData
+from sb3_progpolicy.spaces import ActionKind, ActionSpec
 
 MAX_CONDITIONS = 64
 MAX_NUMBERS = 100_000  # length of X and of a controller's output
@@ -15,13 +16,13 @@ MAX_NAME_LENGTH = 200
 MAX_METADATA_DEPTH = 16
 
 
-def check_program(program: Program) -> None:
+def check_program(program: ProgramData) -> None:
     """Check that sizes agree, numbers are finite and names are printable.
 
     :param program: any program
     :raises ValueError: naming the first field at fault, what it holds and what is accepted
     """
-    if not isinstance(program, Program):
+    if not isinstance(program, ProgramData):
         raise ValueError(f"{type(program).__name__} given; a sb3_progpolicy.programs.Program is accepted")
     _check_action(program.action)
     _check_inputs(program)
@@ -62,12 +63,12 @@ def _check_action(action: ActionSpec) -> None:
         raise ValueError("action.low: a lower bound is above its upper bound in action.high")
 
 
-def _check_inputs(program: Program) -> None:
+def _check_inputs(program: ProgramData) -> None:
     if not _is_int(program.n_observations) or not 0 <= program.n_observations <= MAX_NUMBERS:
         raise ValueError(f"n_observations={program.n_observations!r} is not accepted; 0 to {MAX_NUMBERS}")
     if not isinstance(program.interaction, bool):
         raise ValueError(f"interaction={program.interaction!r} is not accepted; it is true or false")
-    history = program.action.history_size + 2 if program.interaction else 0
+    history = program.action.interaction_size if program.interaction else 0
     _check_names("input_names", program.input_names, program.n_observations + history)
 
 
@@ -88,7 +89,7 @@ def _check_condition(path: str, condition: Condition, n_inputs: int) -> None:
     _check_vector(f"{path}.readout_bias", (condition.readout_bias,), 1)
 
 
-def _check_controller(path: str, controller: Controller, program: Program) -> None:
+def _check_controller(path: str, controller: Controller, program: ProgramData) -> None:
     if not isinstance(controller, Controller):
         raise ValueError(f"{path}: {type(controller).__name__} given; a Controller is accepted")
     _check_matrix(f"{path}.weights", controller.weights, program.action.n_outputs, program.n_inputs)

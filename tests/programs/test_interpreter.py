@@ -85,7 +85,7 @@ def test_crisp_action_is_that_of_the_first_condition_that_holds(program, seed):
             holds = [bool(value >= 0) for value in runner.condition_values[row]]
             taken = [*holds, True].index(True)
             assert runner.branch[row] == taken
-            assert runner.masses[row].tolist() == [float(k == taken) for k in range(len(program.controllers))]
+            assert runner.mixture_weights[row].tolist() == [float(k == taken) for k in range(len(program.controllers))]
             controller = program.controllers[taken]
             output = np.array(controller.weights) @ x[row] + controller.bias
             np.testing.assert_allclose(actions[row], expected_action(program.action, output), rtol=1e-6)
@@ -144,8 +144,8 @@ def test_soft_masses_follow_the_formula(program, seed):
     for k in range(len(program.controllers)):
         last = k == len(program.conditions)
         expected = np.prod(1 - chosen[:, :k], axis=1) * (1 if last else chosen[:, k])
-        np.testing.assert_allclose(runner.masses[:, k], expected, atol=1e-12)
-    np.testing.assert_allclose(runner.masses.sum(axis=1), 1)
+        np.testing.assert_allclose(runner.mixture_weights[:, k], expected, atol=1e-12)
+    np.testing.assert_allclose(runner.mixture_weights.sum(axis=1), 1)
 
 
 def two_constants(action, first, second, bias):
@@ -279,4 +279,4 @@ def test_very_large_inputs_do_not_overflow(data):
     for sign in (1, -1):
         action = runner.act(np.full((1, program.n_inputs), sign * 1e30))
         assert np.isfinite(action).all()
-        assert np.isfinite(runner.masses).all()
+        assert np.isfinite(runner.mixture_weights).all()

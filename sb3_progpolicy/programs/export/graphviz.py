@@ -14,11 +14,11 @@ from sb3_progpolicy.programs.export.visitor import (
     largest_terms,
     title,
 )
-from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, Program
+from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, ProgramData
 
 
 def export_graphviz(
-    program: Program,
+    program: ProgramData,
     out_file: str | os.PathLike[str] | Any | None = None,
     decimals: int = 2,
     max_terms: int | None = 3,
@@ -48,7 +48,7 @@ def export_graphviz(
 
 
 class _DotPrinter(ProgramVisitor[list[str]]):
-    def __init__(self, program: Program, decimals: int, max_terms: int | None) -> None:
+    def __init__(self, program: ProgramData, decimals: int, max_terms: int | None) -> None:
         super().__init__(program)
         self.decimals, self.max_terms = decimals, max_terms
 

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from sb3_progpolicy.programs.export.visitor import ProgramVisitor, deliver
-from sb3_progpolicy.programs.syntax import GATES, ActionSpec, Condition, Controller, IfThenElse, Matrix, Program
+from sb3_progpolicy.programs.syntax import GATES, Condition, Controller, IfThenElse, Matrix, ProgramData
+from sb3_progpolicy.spaces import ActionSpec
 
 _ESCAPES = {
     "\\": r"\textbackslash{}",
@@ -36,7 +37,7 @@ _CELLS = {
 
 
 def export_latex(
-    program: Program, out_file: str | os.PathLike[str] | Any | None = None, decimals: int = 2
+    program: ProgramData, out_file: str | os.PathLike[str] | Any | None = None, decimals: int = 2
 ) -> str | None:
     r"""Typeset a program: the case distinction, the conditions' recurrences and all matrices, in the paper's notation.
 
@@ -52,7 +53,7 @@ def export_latex(
 
 
 class _LatexPrinter(ProgramVisitor[list[str]]):
-    def __init__(self, program: Program, decimals: int) -> None:
+    def __init__(self, program: ProgramData, decimals: int) -> None:
         super().__init__(program)
         self.decimals = decimals
 

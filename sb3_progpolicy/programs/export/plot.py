@@ -14,7 +14,7 @@ from sb3_progpolicy.programs.export.visitor import (
     largest_terms,
     title,
 )
-from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, Program
+from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, ProgramData
 
 INK, QUIET, LINE = "#263238", "#78858c", "#b4bec4"
 CONDITION_FILL, CONDITION_EDGE = "#fdf3dc", "#e0a526"
@@ -42,7 +42,7 @@ class _Card:
 
 
 def plot_program(
-    program: Program, ax: Any = None, decimals: int = 1, max_terms: int = 3, max_outputs: int = MAX_ROWS
+    program: ProgramData, ax: Any = None, decimals: int = 1, max_terms: int = 3, max_outputs: int = MAX_ROWS
 ) -> Any:
     """Draw a program: conditions on the left from top to bottom, the controller that each leads to on the right.
 
@@ -95,7 +95,7 @@ def plot_program(
     return ax
 
 
-def _how_to_read(program: Program) -> tuple[str, ...]:
+def _how_to_read(program: ProgramData) -> tuple[str, ...]:
     """Two lines for a reader who has never seen a program."""
     what = {
         "discrete": "The score of each action: the highest wins.",
@@ -113,7 +113,7 @@ def _how_to_read(program: Program) -> tuple[str, ...]:
 class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
     """Turns every step of the program into a condition card (none for the last) and a controller card."""
 
-    def __init__(self, program: Program, decimals: int, max_terms: int, max_outputs: int) -> None:
+    def __init__(self, program: ProgramData, decimals: int, max_terms: int, max_outputs: int) -> None:
         super().__init__(program)
         self.decimals, self.max_terms, self.max_outputs = decimals, max_terms, max_outputs
 

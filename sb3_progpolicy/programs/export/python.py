@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sb3_progpolicy.programs.export.visitor import CELL_NAMES, ProgramVisitor, counted, deliver, gate_names, pack, title
-from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, Program
+from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, ProgramData
 
 WIDTH = 110
 TERMS_PER_STATEMENT = 50  # Python's own parser and compiler limit how long a sum may be
@@ -30,7 +30,7 @@ _TAKEN = {
 _TAKEN |= {"tanh", "float", "int", "len", "max", "min", "map"}
 
 
-def export_python(program: Program, out_file: str | os.PathLike[str] | Any | None = None) -> str | None:
+def export_python(program: ProgramData, out_file: str | os.PathLike[str] | Any | None = None) -> str | None:
     """Write a program as one standalone Python file (Python 3.8 or newer, standard library only).
 
     Its class ``ProgramPolicy`` has ``reset()`` and ``act(observation, previous_action, previous_reward,
@@ -55,7 +55,7 @@ class _Row:
 
 
 class _PythonPrinter(ProgramVisitor[list[str]]):
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: ProgramData) -> None:
         super().__init__(program)
         action = program.action
         self.one_hot = program.interaction and action.kind in ("discrete", "multi_discrete")
@@ -314,7 +314,8 @@ def _cell(cell: str, unit: str) -> Iterator[str]:
     if cell == "gru":
         yield f"r{unit} = 0.5 + 0.5 * tanh(0.5 * r{unit})"
         yield f"z{unit} = 0.5 + 0.5 * tanh(0.5 * z{unit})"
-        yield f"h{unit} = (1.0 - z{unit}) * tanh(n{unit} + r{unit} * u{unit}) + z{unit} * h{unit}"
+        yield f"n{unit} = tanh(n{unit} + r{unit} * u{unit})"
+        yield f"h{unit} = n{unit} + z{unit} * (h{unit} - n{unit})"
     elif cell == "lstm":
         yield f"i{unit} = 0.5 + 0.5 * tanh(0.5 * i{unit})"
         yield f"f{unit} = 0.5 + 0.5 * tanh(0.5 * f{unit})"

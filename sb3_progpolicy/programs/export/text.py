@@ -14,7 +14,7 @@ from sb3_progpolicy.programs.export.visitor import (
     pack,
     title,
 )
-from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, Program
+from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, ProgramData
 
 WIDTH = 110
 INDENT = "    "
@@ -26,7 +26,7 @@ _RULES = {
 }
 
 
-def export_text(program: Program, decimals: int = 2, max_terms: int | None = 6) -> str:
+def export_text(program: ProgramData, decimals: int = 2, max_terms: int | None = 6) -> str:
     """Print a program as an indented if-then-else that a person can read.
 
     The terms of every sum stand in order of size; those that round to zero or come after ``max_terms`` are counted
@@ -42,7 +42,7 @@ def export_text(program: Program, decimals: int = 2, max_terms: int | None = 6) 
 
 
 class _TextPrinter(ProgramVisitor[list[str]]):
-    def __init__(self, program: Program, decimals: int, max_terms: int | None) -> None:
+    def __init__(self, program: ProgramData, decimals: int, max_terms: int | None) -> None:
         super().__init__(program)
         self.decimals, self.max_terms = decimals, max_terms
 

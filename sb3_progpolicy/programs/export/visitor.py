@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from sb3_progpolicy.programs.files import write_atomically
-from sb3_progpolicy.programs.syntax import GATES, ActionSpec, Condition, Controller, Expression, IfThenElse, Program
+from sb3_progpolicy.programs.syntax import GATES, Condition, Controller, Expression, IfThenElse, ProgramData
 from sb3_progpolicy.programs.validation import check_program
+from sb3_progpolicy.spaces import ActionSpec
 
 Result = TypeVar("Result")
 
@@ -24,7 +25,7 @@ class ProgramVisitor(ABC, Generic[Result]):
     :raises ValueError: if the program is not well formed
     """
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: ProgramData) -> None:
         check_program(program)
         self.program = program
 
@@ -103,7 +104,7 @@ def action_rule(action: ActionSpec) -> str:
     return "Each line gives one number of the action, which is then clipped to its bounds."
 
 
-def title(program: Program) -> str:
+def title(program: ProgramData) -> str:
     """The program's name, from ``metadata["env"]`` where that is a printable string."""
     environment = program.metadata.get("env")
     known = isinstance(environment, str) and environment.isprintable() and 0 < len(environment) <= 100

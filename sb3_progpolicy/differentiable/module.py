@@ -1,4 +1,9 @@
-"""The differentiable program: every derivation of the graph computed at once, mixed by W."""
+"""The differentiable program: every program of the derivation graph computed at once, mixed by W.
+
+Layer k of a derivation graph of depth d chooses between ``E_k ::= C_k`` and ``E_k ::= if B_k then C'_k else E_{k+1}``;
+the last layer is ``C_d`` (grammar of figure 1). So there are d complete programs, of 0 to d - 1 conditions, which share
+their conditions and then-controllers.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +13,10 @@ from typing import Any, cast
 import torch as th
 from torch import nn
 
-from sb3_progpolicy.programs.grammar import derivations
-from sb3_progpolicy.programs.recurrence import scan
-from sb3_progpolicy.programs.search import DerivationSearch
-from sb3_progpolicy.programs.syntax import GATES, ActionSpec, Cell, Condition, Controller, Expression, IfThenElse
+from sb3_progpolicy.differentiable.recurrence import scan
+from sb3_progpolicy.differentiable.search import DerivationSearch
+from sb3_progpolicy.programs.syntax import GATES, Cell, Condition, Controller, Expression, IfThenElse
+from sb3_progpolicy.spaces import ActionSpec
 
 State = tuple[th.Tensor, th.Tensor]
 
@@ -136,9 +141,9 @@ class ProgramModule(nn.Module):
     """All programs of a derivation graph under the soft semantics of section 2.2, mixed with W's probabilities.
 
     ``[[if B then C else E]] = s(B)·C + (1 - s(B))·E`` with ``s`` the sigmoid. The mixture is linear in the
-    controllers, so that each of the ``2 depth - 1`` controllers has one weight, here called its mass: the probability
-    that a program is drawn from W and its branches, drawn from the sigmoids, lead to that controller. One cumulative
-    product over the conditions and one over the choices give all masses in O(depth).
+    controllers, so that each of the ``2 depth - 1`` controllers has one weight: the probability that a program is drawn
+    from W and its branches, drawn from the sigmoids, lead to that controller. One cumulative product over the
+    conditions and one over the choices give all mixture weights in O(depth).
 
     For discrete actions the controllers' action probabilities are mixed, for Box actions their values.
 
@@ -160,8 +165,9 @@ class ProgramModule(nn.Module):
         temperature: float = 1.0,
     ) -> None:
         super().__init__()
+        if depth < 1:
+            raise ValueError(f"depth={depth} is not accepted; a derivation graph has at least 1 layer")
         self.n_inputs, self.action, self.depth = n_inputs, action, depth
-        self.derivations = derivations(depth)
         self.conditions = Conditions(n_inputs, depth - 1, cell, condition_size)
         # Rows: the then-controllers C'_1 ... C'_K, then the last controllers C_1 ... C_depth.
         self.controllers = nn.Linear(n_inputs, (2 * depth - 1) * action.n_outputs)
@@ -183,17 +189,18 @@ class ProgramModule(nn.Module):
             else self._controller_rows(self.search.most_likely())
         )
 
-    def reach(self, tests: th.Tensor, crisp: bool = False) -> th.Tensor:
+    def path_probabilities(self, condition_values: th.Tensor, crisp: bool = False) -> th.Tensor:
         """Return how probable it is for the branches of its program to lead to each controller in use.
 
-        :param tests: the values of B, ``(..., depth - 1)``
+        :param condition_values: the values of B, ``(..., depth - 1)``
         :param crisp: decide each branch by ``B >= 0`` instead of weighing it
         :return: ``(..., n_in_use)``, then-controllers first; the last controllers are those of programs of any length
         """
+        values = condition_values
         if not self.search.searching:
-            tests = tests[..., : self.search.most_likely()]
-        taken = (tests >= 0).to(tests.dtype) if crisp else th.sigmoid(tests / self.temperature)
-        reached = th.cat((tests.new_ones(*tests.shape[:-1], 1), th.cumprod(1 - taken, dim=-1)), dim=-1)
+            values = values[..., : self.search.most_likely()]
+        taken = (values >= 0).to(values.dtype) if crisp else th.sigmoid(values / self.temperature)
+        reached = th.cat((values.new_ones(*values.shape[:-1], 1), th.cumprod(1 - taken, dim=-1)), dim=-1)
         last = reached if self.search.searching else reached[..., -1:]
         return th.cat((taken * reached[..., :-1], last), dim=-1)
 
@@ -203,31 +210,31 @@ class ProgramModule(nn.Module):
             return self.controllers.weight.new_ones(self.search.most_likely() + 1)
         return th.cat((self.search.at_least(), self.search.probabilities()))
 
-    def masses(self, tests: th.Tensor, crisp: bool = False) -> th.Tensor:
-        """Return the mass of every controller in use, non-negative and summing to 1. See :meth:`reach`."""
-        reach = self.reach(tests, crisp)
-        return reach * self.choices() if self.search.searching else reach
+    def mixture_weights(self, condition_values: th.Tensor, crisp: bool = False) -> th.Tensor:
+        """Return the weight of every controller in use; they sum to 1. See :meth:`path_probabilities`."""
+        paths = self.path_probabilities(condition_values, crisp)
+        return paths * self.choices() if self.search.searching else paths
 
-    def mix(self, inputs: th.Tensor, masses: th.Tensor) -> th.Tensor:
+    def mix(self, inputs: th.Tensor, mixture_weights: th.Tensor) -> th.Tensor:
         """Return the parameters of the action distribution.
 
         :param inputs: X, ``(..., n_inputs)``
-        :param masses: ``(..., n_in_use)``
+        :param mixture_weights: ``(..., n_in_use)``
         :return: ``(..., n_outputs)``: means for Box, log-probabilities for Discrete and MultiDiscrete (per component),
             log-odds for MultiBinary
         """
-        weights = masses.flatten(0, -2).T.unsqueeze(1)
+        weights = mixture_weights.flatten(0, -2).T.unsqueeze(1)
         mixed = (weights * self._terms(inputs)).sum(0)
         return self._to_parameters(mixed.T.unflatten(0, inputs.shape[:-1]))
 
-    def derivation_terms(self, inputs: th.Tensor, tests: th.Tensor) -> th.Tensor:
+    def derivation_terms(self, inputs: th.Tensor, condition_values: th.Tensor) -> th.Tensor:
         """Return the matrices by which the mixture is linear in W's probabilities, as long as phi stays.
 
         :param inputs: X, ``(n, n_inputs)``
-        :param tests: the values of B, ``(n, depth - 1)``
+        :param condition_values: the values of B, ``(n, depth - 1)``
         :return: ``(n, n_terms, n_in_use)``, for :meth:`mix_derivation`
         """
-        terms = self.reach(tests).T.unsqueeze(1) * self._terms(inputs)
+        terms = self.path_probabilities(condition_values).T.unsqueeze(1) * self._terms(inputs)
         return terms.permute(2, 1, 0).contiguous()
 
     def mix_derivation(self, terms: th.Tensor) -> th.Tensor:
@@ -277,10 +284,10 @@ class ProgramModule(nn.Module):
         :return: distribution parameters ``(n_steps, n_sequences, n_outputs)`` (see :meth:`mix`) and the new state
         """
         if self.search.needs_conditions:
-            tests, state = self.conditions(inputs, state)
+            condition_values, state = self.conditions(inputs, state)
         else:
-            tests = inputs.new_zeros(*inputs.shape[:-1], self.depth - 1)
-        return self.mix(inputs, self.masses(tests, crisp)), state
+            condition_values = inputs.new_zeros(*inputs.shape[:-1], self.depth - 1)
+        return self.mix(inputs, self.mixture_weights(condition_values, crisp)), state
 
     def initial_state(self, n_sequences: int) -> State:
         """Return the zero state of ``n_sequences`` sequences."""

@@ -8,8 +8,8 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 
+from sb3_progpolicy.differentiable.module import ProgramModule, State
 from sb3_progpolicy.programs.cells import STEPS, Array, sigmoid
-from sb3_progpolicy.programs.modules import ProgramModule, State
 
 
 class ProgramSampler:
@@ -66,7 +66,7 @@ class ProgramSampler:
         n_envs = len(self._hidden)
         self._rows, self._step = np.arange(n_envs), 0
         #: Values of B at the steps made so far, ``(n_steps, n_envs, n_conditions)``; 0 where none is needed.
-        self.recorded_tests = np.zeros((n_steps, n_envs, self.n_conditions), dtype=np.float32)
+        self.condition_values = np.zeros((n_steps, n_envs, self.n_conditions), dtype=np.float32)
         self._n_controllers = module.n_controllers
         # Noise of all steps is drawn at once, which is several times cheaper than a little at every step.
         if self.action.kind == "box":
@@ -78,15 +78,15 @@ class ProgramSampler:
 
     def _draw_programs(self, shape: tuple[int, int, int], rng: np.random.Generator) -> None:
         """Draw a program for every action, how its branches will fall, and the noise of its controller's choice."""
-        n_tests = self.n_conditions if self._selected is None else self._selected
-        self._last_controllers = np.full(shape, n_tests)
+        n_used = self.n_conditions if self._selected is None else self._selected
+        self._last_controllers = np.full(shape, n_used)
         # B plus logistic noise is above 0 with the probability sigmoid(B).
-        self._thresholds = self._temperature * _logistic(rng, (n_tests, *shape))
+        self._thresholds = self._temperature * _logistic(rng, (n_used, *shape))
         if self._selected is None:
-            edges = np.cumsum(self._choices[n_tests:-1])
+            edges = np.cumsum(self._choices[n_used:-1])
             lengths = np.searchsorted(edges, rng.random(shape, dtype=np.float32), side="right")
             self._last_controllers += lengths
-            self._thresholds[np.arange(n_tests)[:, None, None, None] >= lengths] = np.inf  # not in this program
+            self._thresholds[np.arange(n_used)[:, None, None, None] >= lengths] = np.inf  # not in this program
         # Logits plus logistic noise are above 0 as often as their sigmoid says; the largest of logits plus Gumbel noise
         # is a draw from their softmax.
         size = (shape[0], shape[2], self.action.n_outputs)
@@ -99,27 +99,27 @@ class ProgramSampler:
         hidden, cell = (th.from_numpy(array)[None] for array in (self._hidden, self._cell))
         return hidden, cell
 
-    def masses(self, tests: Array) -> Array:
-        """Return the mass of every controller in use, as :meth:`ProgramModule.masses` does.
+    def mixture_weights(self, condition_values: Array) -> Array:
+        """Return the weight of every controller in use, as :meth:`ProgramModule.mixture_weights` does.
 
-        :param tests: ``(n_envs, n_conditions)``
+        :param condition_values: ``(n_envs, n_conditions)``
         """
-        tests = tests[:, : self._selected]
-        if not tests.shape[1]:
-            return np.ones((len(tests), 1), dtype=np.float32)
-        taken = sigmoid(tests / self._temperature)
-        reached = np.empty((len(tests), tests.shape[1] + 1), dtype=np.float32)
+        values = condition_values[:, : self._selected]
+        if not values.shape[1]:
+            return np.ones((len(values), 1), dtype=np.float32)
+        taken = sigmoid(values / self._temperature)
+        reached = np.empty((len(values), values.shape[1] + 1), dtype=np.float32)
         reached[:, 0] = 1
         np.multiply.accumulate(1 - taken, axis=1, out=reached[:, 1:])
         last = reached if self._selected is None else reached[:, -1:]
-        masses = np.concatenate((taken * reached[:, :-1], last), axis=1)
-        return masses * self._choices if self._selected is None else masses
+        weights = np.concatenate((taken * reached[:, :-1], last), axis=1)
+        return weights * self._choices if self._selected is None else weights
 
     def branch_frequencies(self) -> Array:
         """Return how probable it was at the steps so far that each controller decided, ``(2 depth - 1,)``."""
         shares = np.zeros(self._n_controllers)
-        tests = self.recorded_tests[: self._step].reshape(self._step * len(self._rows), self.n_conditions)
-        shares[self._in_use] = self.masses(tests).mean(0)
+        condition_values = self.condition_values[: self._step].reshape(self._step * len(self._rows), self.n_conditions)
+        shares[self._in_use] = self.mixture_weights(condition_values).mean(0)
         return shares
 
     def sample(self, inputs: Array) -> NDArray[Any]:
@@ -132,11 +132,11 @@ class ProgramSampler:
         affine = inputs @ self._affine
         affine += self._constant
         if self.needs_conditions:
-            self._run_conditions(affine[:, : self._n_gates], out=self.recorded_tests[step])
+            self._run_conditions(affine[:, : self._n_gates], out=self.condition_values[step])
         outputs = affine[:, self._n_gates :].reshape(len(inputs), len(self._in_use), -1)
         if self.action.kind == "box":
-            masses = self.masses(self.recorded_tests[step])
-            return (masses[:, :, None] * outputs).sum(1) + self._std * self._noise[step]
+            weights = self.mixture_weights(self.condition_values[step])
+            return (weights[:, :, None] * outputs).sum(1) + self._std * self._noise[step]
         if self.action.kind == "discrete":
             return (outputs[self._rows, self._controllers(step, 0)] + self._noise[step]).argmax(1)
         components = np.split(outputs + self._noise[step][:, None], self._edges, axis=2)
@@ -149,7 +149,7 @@ class ProgramSampler:
         """Run the programs drawn for one component of the action; return which controller decides, ``(n_envs,)``."""
         controllers = self._last_controllers[step, component]
         for k in reversed(range(len(self._thresholds))):
-            np.copyto(controllers, k, where=self.recorded_tests[step, :, k] > self._thresholds[k, step, component])
+            np.copyto(controllers, k, where=self.condition_values[step, :, k] > self._thresholds[k, step, component])
         return controllers
 
     def _run_conditions(self, gates: Array, out: Array) -> None:

@@ -8,8 +8,8 @@ import torch as th
 from torch import nn
 
 from progpolicy_envs.hanoi import HanoiVectorEnv
+from sb3_progpolicy.differentiable.module import Conditions, ProgramModule
 from sb3_progpolicy.programs import ActionSpec, Program, ProgramRunner, export_python
-from sb3_progpolicy.programs.modules import Conditions, ProgramModule
 
 CELLS = ("affine", "rnn", "gru", "lstm")
 ACTIONS = {
@@ -104,14 +104,14 @@ def test_mixture_is_the_sum_of_all_programs_run_recursively(kind, cell, crisp):
 
 
 @pytest.mark.parametrize("depth", [1, 2, 5])
-def test_masses_are_non_negative_and_sum_to_one(depth):
+def test_mixture_weights_are_non_negative_and_sum_to_one(depth):
     module = make_module(depth=depth)
-    tests, _ = module.conditions(make_inputs(), module.initial_state(N_SEQUENCES))
+    values, _ = module.conditions(make_inputs(), module.initial_state(N_SEQUENCES))
     for crisp in (False, True):
-        masses = module.masses(tests, crisp)
-        assert masses.shape == (N_STEPS, N_SEQUENCES, 2 * depth - 1)
-        assert (masses >= 0).all()
-        th.testing.assert_close(masses.sum(-1), th.ones(N_STEPS, N_SEQUENCES))
+        weights = module.mixture_weights(values, crisp)
+        assert weights.shape == (N_STEPS, N_SEQUENCES, 2 * depth - 1)
+        assert (weights >= 0).all()
+        th.testing.assert_close(weights.sum(-1), th.ones(N_STEPS, N_SEQUENCES))
 
 
 @pytest.mark.parametrize("cell", CELLS)

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sb3_progpolicy.cli.parsing import default_variations, find_source, parse_variations
+from sb3_progpolicy.cli.parsing import default_variations, parse_variations
 from sb3_progpolicy.cli.streams import quiet_stdout
+from sb3_progpolicy.experiment.sources import find_source
 from sb3_progpolicy.nearest import unknown
 
 if TYPE_CHECKING:

@@ -9,11 +9,12 @@ from typing import Annotated, Any
 
 import typer
 
-from sb3_progpolicy.cli.parsing import check_folder, find_source
+from sb3_progpolicy.cli.parsing import check_folder
 from sb3_progpolicy.cli.streams import quiet_stdout
+from sb3_progpolicy.experiment.sources import find_source
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.programs.files import write_atomically
-from sb3_progpolicy.programs.syntax import Program
+from sb3_progpolicy.programs.program import Program
 
 FORMATS = ("text", "latex", "dot", "python", "png")
 

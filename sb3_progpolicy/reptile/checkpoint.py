@@ -36,6 +36,7 @@ class ReptileCheckpoint(BaseCallback):
             raise ValueError(f"save_freq={save_freq} is not accepted; it is at least 0")
         self.path, self.save_freq = Path(path), save_freq
         self._boundary: bytes | None = None
+        self._boundary_iteration = -1
         self._next_save = save_freq
 
     def save(self) -> bool:
@@ -51,10 +52,12 @@ class ReptileCheckpoint(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._next_save = self.num_timesteps + self.save_freq
+        self._boundary_iteration = -1
 
     def _on_rollout_start(self) -> None:
-        if not self.model.reptile.at_task_start:
-            return
+        if self.model.meta_iteration == self._boundary_iteration:
+            return  # in the middle of a task
+        self._boundary_iteration = self.model.meta_iteration
         buffer = io.BytesIO()
         self.model.save(buffer)
         self._boundary = buffer.getvalue()

@@ -11,6 +11,7 @@ import typer
 from rich.console import Console
 
 from sb3_progpolicy.cli.parsing import parse_pairs
+from sb3_progpolicy.hyperparams import algorithms
 
 # Flags that decide the outcome, which a resumed run takes from its folder.
 _DECIDED = ("--algo", "--env", "--seed", "--hyperparams", "--env-kwargs", "--trained-agent", "--device")
@@ -18,7 +19,7 @@ _DECIDED = ("--algo", "--env", "--seed", "--hyperparams", "--env-kwargs", "--tra
 
 def train(
     context: typer.Context,
-    algo: Annotated[str, typer.Option("--algo", help="reptile_ppo, ppo or recurrent_ppo")] = "reptile_ppo",
+    algo: Annotated[str, typer.Option("--algo", help=f"one of {', '.join(algorithms())}")] = "reptile_ppo",
     env: Annotated[str, typer.Option("--env", help="environment id")] = "Hanoi-v0",
     seed: Annotated[int, typer.Option("--seed", help="of everything random; negative: drawn, and noted")] = -1,
     log_folder: Annotated[Path, typer.Option("-f", "--log-folder", help="folder of all runs")] = Path("runs"),
@@ -56,19 +57,21 @@ def train(
     """
     import torch
 
-    from sb3_progpolicy import training
+    from sb3_progpolicy.experiment import config as configs
+    from sb3_progpolicy.experiment import folder as folders
+    from sb3_progpolicy.experiment import run
 
     torch.set_num_threads(num_threads)
-    options = training.TrainingOptions(progress, save_freq, eval_freq, eval_episodes, log_interval)
+    options = run.TrainingOptions(progress, save_freq, eval_freq, eval_episodes, log_interval)
     console = Console(stderr=True)
     model: Any
     wrapper = None
     if resume is not None:
         _refuse_decided(context)
         folder = resume
-        model, config = training.resume(folder, n_timesteps if n_timesteps > 0 else None, max(0, verbose - 1))
+        model, config = run.resume(folder, n_timesteps if n_timesteps > 0 else None, max(0, verbose - 1))
     else:
-        config = training.make_config(
+        config = configs.make_config(
             algo,
             env,
             secrets.randbelow(2**31) if seed < 0 else seed,
@@ -77,16 +80,16 @@ def train(
             parse_pairs("--hyperparams", hyperparams or ()),
             device,
         )
-        model, wrapper = training.build_model(config, tensorboard_log or None, max(0, verbose - 1))
+        model, wrapper = run.build_model(config, tensorboard_log or None, max(0, verbose - 1))
         if trained_agent:
-            training.start_from(model, trained_agent)
+            run.start_from(model, trained_agent)
         given = {name: str(value) if isinstance(value, Path) else value for name, value in context.params.items()}
-        folder = training.create_run(log_folder, config, given)
+        folder = folders.create_run(log_folder, config, given)
     if verbose:
         console.print(f"{config.algo} on {config.env}, seed {config.seed}, {config.n_timesteps} steps: {folder}")
     try:
-        training.train(model, config, folder, wrapper, options)
-    except training.Interrupted as interruption:
+        run.train(model, config, folder, wrapper, options)
+    except run.Interrupted as interruption:
         _say_how_to_go_on(interruption, folder, config, progress)
         raise typer.Exit(130) from None
     if verbose:
@@ -113,8 +116,8 @@ def _say_how_to_go_on(interruption: Any, folder: Path, config: Any, progress: bo
 
 
 def _show_result(folder: Path, console: Console) -> None:
-    from sb3_progpolicy.programs.io import load_program
-    from sb3_progpolicy.training import PROGRAM
+    from sb3_progpolicy.experiment.folder import PROGRAM
+    from sb3_progpolicy.programs.program import load_program
 
     if (folder / PROGRAM).is_file():
         typer.echo(str(load_program(folder / PROGRAM)))

@@ -4,7 +4,7 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_progpolicy.programs.recurrence import scan
+from sb3_progpolicy.differentiable.recurrence import scan
 
 LAYERS = {"rnn": nn.RNN, "gru": nn.GRU}
 

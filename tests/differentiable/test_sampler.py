@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_progpolicy.programs.sampler import ProgramSampler
-from tests.programs.test_modules import ACTIONS, CELLS, N_INPUTS, make_module, meaning_of_mixture
+from sb3_progpolicy.differentiable.sampler import ProgramSampler
+from tests.differentiable.test_module import ACTIONS, CELLS, N_INPUTS, make_module, meaning_of_mixture
 
 N_DRAWS = 20_000
 
@@ -64,8 +64,8 @@ def test_states_are_those_of_the_module(cell, size):
 
 
 @pytest.mark.parametrize("depth", [1, 3])
-def test_masses_are_those_of_the_module(depth):
+def test_mixture_weights_are_those_of_the_module(depth):
     module = make_module(depth=depth)
-    tests = np.random.default_rng(0).normal(size=(7, depth - 1)).astype(np.float32)
-    masses = make_sampler(module).masses(tests)
-    np.testing.assert_allclose(masses, module.masses(th.from_numpy(tests)).detach(), atol=1e-6)
+    values = np.random.default_rng(0).normal(size=(7, depth - 1)).astype(np.float32)
+    weights = make_sampler(module).mixture_weights(values)
+    np.testing.assert_allclose(weights, module.mixture_weights(th.from_numpy(values)).detach(), atol=1e-6)

@@ -5,15 +5,7 @@ import math
 import pytest
 import torch as th
 
-from sb3_progpolicy.programs.grammar import derivations
-from sb3_progpolicy.programs.search import DerivationSearch
-
-
-def test_graph_of_depth_d_holds_the_programs_of_0_to_d_minus_1_conditions():
-    assert [derivation.n_conditions for derivation in derivations(4)] == [0, 1, 2, 3]
-    assert str(derivations(3)[2]) == "if B1 then C1' else if B2 then C2' else C3"
-    with pytest.raises(ValueError, match="depth=0 is not accepted"):
-        derivations(0)
+from sb3_progpolicy.differentiable.search import DerivationSearch
 
 
 def test_choices_start_at_even_odds():

@@ -1,0 +1,1 @@
+"""Experiments: the registry of methods, checked configurations, run folders, and training that can be resumed."""

@@ -1,0 +1,170 @@
+"""What decides the outcome of a run: method, environment, seed and hyperparameters, all of them checked."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from gymnasium.envs.registration import load_env_creator
+from stable_baselines3.common.utils import LinearSchedule
+
+from sb3_progpolicy.evaluation import spec_of
+from sb3_progpolicy.experiment.methods import METHODS, get_method
+from sb3_progpolicy.hyperparams import load_hyperparams, parse_kwargs, parse_number
+from sb3_progpolicy.nearest import unknown
+from sb3_progpolicy.reptile.callback import ReptileWrapper
+from sb3_progpolicy.reptile_ppo.environments import DEFAULT_N_ENVS
+
+#: Hyperparameters of ReptileWrapper, which a stock algorithm is trained with if any of them is given.
+REPTILE = ("tasks", "inner_updates", "tasks_per_iteration", "meta_learning_rate", "meta_optimizer", "meta_update")
+_SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "meta_learning_rate", "temperature", "action_std")
+# Arguments of the constructors that have a flag of their own or no place in a file.
+_ELSEWHERE = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
+_ELSEWHERE |= {"rollout_buffer_class", "rollout_buffer_kwargs"}
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """All that decides the outcome of a run; written to its folder.
+
+    :param algo: a key of :data:`~sb3_progpolicy.experiment.methods.METHODS`
+    :param env: environment id
+    :param seed: of everything random
+    :param env_kwargs: constructor arguments of the environment
+    :param hyperparams: ``policy``, ``n_timesteps``, ``n_envs`` and the algorithm's arguments, as in the YAML files
+    :param device: torch device
+    """
+
+    algo: str
+    env: str
+    seed: int
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    hyperparams: Mapping[str, Any] = field(default_factory=dict)
+    device: str = "auto"
+
+    @property
+    def n_timesteps(self) -> int:
+        """Environment steps of the whole training."""
+        return int(self.hyperparams["n_timesteps"])
+
+
+def make_config(
+    algo: str,
+    env_id: str,
+    seed: int,
+    n_timesteps: int | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    device: str = "auto",
+) -> RunConfig:
+    """Read the hyperparameters of an algorithm for an environment, put in what overrides them, and check all of it.
+
+    :param algo: a key of :data:`~sb3_progpolicy.experiment.methods.METHODS`
+    :param env_id: a registered environment id
+    :param seed: of everything random
+    :param n_timesteps: in place of the file's
+    :param env_kwargs: constructor arguments of the environment
+    :param overrides: hyperparameters in place of the file's
+    :param device: torch device
+    :raises ValueError: if a name or a value is not accepted; the message names the nearest names
+    """
+    method = get_method(algo)
+    hyperparams = {**load_hyperparams(method.hyperparams, env_id), **(overrides or {})}
+    if n_timesteps is not None:
+        hyperparams["n_timesteps"] = n_timesteps
+    env_kwargs = {**parse_kwargs("env_kwargs", hyperparams.pop("env_kwargs", None)), **(env_kwargs or {})}
+    _check_env_kwargs(env_id, env_kwargs)
+    accepted = _accepted(algo)
+    for name in hyperparams:
+        if name not in accepted:
+            raise unknown("hyperparameter", name, [*accepted, "env_kwargs"])
+    checked = {name: _checked(name, value, accepted[name]) for name, value in hyperparams.items()}
+    config = RunConfig(algo, env_id, seed, env_kwargs, checked, device)
+    _check_policy(config)
+    return config
+
+
+def _check_env_kwargs(env_id: str, env_kwargs: Mapping[str, Any]) -> None:
+    constructor = inspect.signature(load_env_creator(str(spec_of(env_id).entry_point))).parameters
+    if any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in constructor.values()):
+        return
+    for name in env_kwargs:
+        if name not in constructor:
+            raise unknown("environment argument", name, constructor)
+
+
+def _accepted(algo: str) -> dict[str, Any]:
+    """Return the hyperparameters of an algorithm with their defaults."""
+    method = METHODS[algo]
+    signature = inspect.signature(method.algorithm.__init__).parameters
+    accepted = {name: parameter.default for name, parameter in signature.items() if name not in _ELSEWHERE}
+    if not method.has_reptile:
+        reptile = inspect.signature(ReptileWrapper.__init__).parameters
+        accepted |= {name: reptile[name].default for name in REPTILE} | {"interaction_history": False}
+    accepted.pop("env_kwargs", None)
+    return {**accepted, "policy": "", "tasks": None, "n_envs": DEFAULT_N_ENVS, "n_timesteps": 1}
+
+
+def _checked(name: str, value: Any, default: Any) -> Any:
+    """Return a value as the type of its default, so that a slip is an error here and not deep inside torch."""
+    value = parse_number(value)
+    if name == "policy_kwargs":
+        return parse_kwargs(name, value)
+    if name in _SCHEDULES:
+        if value is not None and not isinstance(value, str):
+            return _number(name, value, "a number, lin_<from> or lin_<from>_<to>")
+        if isinstance(value, str):
+            parse_schedule(name, value)
+        return value
+    if isinstance(default, bool):
+        if not isinstance(value, bool):
+            raise ValueError(f"{name}={value!r} is not accepted; it is true or false")
+        return value
+    if isinstance(default, int) or name in ("batch_size", "n_envs"):
+        if value is None and name == "batch_size":
+            return None
+        number = _number(name, value, "a whole number")
+        if number != int(number) or number < 1:
+            raise ValueError(f"{name}={value!r} is not accepted; it is a whole number of at least 1")
+        return int(number)
+    if isinstance(default, float) or (name == "target_kl" and value is not None):
+        return _number(name, value, "a number")
+    return value
+
+
+def _number(name: str, value: Any, accepted: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ValueError(f"{name}={value!r} is not accepted; it is {accepted}")
+    return value
+
+
+def parse_schedule(name: str, value: Any) -> Any:
+    """Return a text as a linear schedule if the hyperparameter may be one, and anything else as it is.
+
+    The zoo's ``lin_0.001`` falls to 0 at the end of the training; ``lin_0.5_0.1`` goes from the first to the second.
+    """
+    if name not in _SCHEDULES or not isinstance(value, str):
+        return value
+    kind, *numbers = value.split("_")
+    ends = [parse_number(number) for number in numbers]
+    if kind != "lin" or len(ends) not in (1, 2) or not all(isinstance(end, float) for end in ends):
+        raise ValueError(f"{name}={value!r} is not accepted; it is a number, lin_<from> or lin_<from>_<to>")
+    return LinearSchedule(ends[0], ends[1] if len(ends) == 2 else 0.0, 1.0)
+
+
+def _check_policy(config: RunConfig) -> None:
+    policy, policies = config.hyperparams.get("policy"), METHODS[config.algo].all_policies
+    if policy not in policies:
+        raise unknown("policy", policy, policies)
+    known = {
+        name
+        for base in policies[policy].__mro__
+        if "__init__" in vars(base)
+        for name, parameter in inspect.signature(vars(base)["__init__"]).parameters.items()
+        if parameter.kind is inspect.Parameter.POSITIONAL_OR_KEYWORD
+    } - {"self", "observation_space", "action_space", "lr_schedule"}
+    for name in config.hyperparams.get("policy_kwargs") or {}:
+        if name not in known:
+            raise unknown("policy_kwargs entry", name, sorted(known))

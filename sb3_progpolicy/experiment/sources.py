@@ -1,0 +1,89 @@
+"""What a name on the command line stands for: a run folder, a program, a model, or a program that is shipped."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sb3_progpolicy.nearest import unknown
+from sb3_progpolicy.pretrained import load_pretrained, pretrained_names
+from sb3_progpolicy.programs.program import Program, load_program
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+
+@dataclass(frozen=True)
+class Source:
+    """What a name on the command line stands for.
+
+    :param name: as given
+    :param env_id: environment it was trained in, if known
+    :param program: if it is one
+    :param model: if it is not a program
+    :param env_kwargs: constructor arguments that it was trained with
+    """
+
+    name: str
+    env_id: str | None
+    program: Program | None
+    model: OnPolicyAlgorithm | None
+    env_kwargs: dict[str, Any]
+
+
+def find_source(name: str) -> Source:
+    """Load a run folder, a program's ``.json``, a model's ``.zip`` or a pretrained program, in this order.
+
+    :param name: a path or a name
+    :raises ValueError: if there is nothing of that name; the message names the nearest pretrained programs
+    """
+    path = Path(name)
+    if path.is_dir():
+        return _from_run(path)
+    if path.is_file() and path.suffix == ".json":
+        return _from_program(name, load_program(path))
+    if path.is_file() and path.suffix == ".zip":
+        return _from_model(path)
+    if path.suffix in (".json", ".zip") or path.is_file():
+        reason = "is neither a .json nor a .zip file" if path.is_file() else "does not exist"
+        raise ValueError(f"{name} {reason}; give a run folder, a program (.json), a model (.zip) or a pretrained name")
+    if name.rpartition(":")[2] in pretrained_names():
+        return _from_program(name, load_pretrained(name))
+    raise unknown("run, file or pretrained program", name, pretrained_names())
+
+
+def _from_program(name: str, program: Program, env_kwargs: dict[str, Any] | None = None) -> Source:
+    env_id = program.metadata.get("env")
+    if env_id is not None and not isinstance(env_id, str):
+        raise ValueError(f"{name}: metadata: env={env_id!r} is not accepted; it is an environment id")
+    return Source(name, env_id, program, None, env_kwargs or {})
+
+
+def _from_run(folder: Path) -> Source:
+    from sb3_progpolicy.experiment.folder import MODEL, PROGRAM, read_config
+
+    config = read_config(folder)
+    if (folder / PROGRAM).is_file():
+        return _from_program(str(folder), load_program(folder / PROGRAM), dict(config.env_kwargs))
+    if not (folder / MODEL).is_file():
+        raise ValueError(f"{folder} holds no model yet")
+    return _from_model(folder / MODEL)
+
+
+def _from_model(path: Path) -> Source:
+    from sb3_progpolicy.experiment.folder import CONFIG, load_model, read_config
+    from sb3_progpolicy.extraction import extract_program, holds_program
+
+    config = read_config(path.parent) if (path.parent / CONFIG).is_file() else None
+    try:
+        model = load_model(path, device="cpu")
+    except ValueError:
+        raise
+    except Exception as error:  # unpickling a damaged file may raise anything
+        raise ValueError(f"{path} is not a model that can be loaded: {error}") from None
+    env_kwargs = dict(config.env_kwargs) if config else {}
+    env_id = config.env if config else getattr(model, "env_id", None)
+    if holds_program(model):
+        return _from_program(str(path), extract_program(model, env=env_id), env_kwargs)
+    return Source(str(path), env_id, None, model, env_kwargs)

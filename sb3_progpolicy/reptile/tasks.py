@@ -1,0 +1,266 @@
+"""Task distributions: the variations to train on, and in which order they are drawn."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+
+from progpolicy_envs import DOMAINS
+
+Variation = dict[str, Any]
+Draw = Callable[[np.random.Generator], Any]
+Apply = Literal["options", "attributes", "constructor"]
+APPLY: tuple[Apply, ...] = ("options", "attributes", "constructor")
+
+
+class Sampler(ABC):
+    """Decides which variation comes next."""
+
+    @abstractmethod
+    def weights(self, n_variations: int, progress: float, success_rates: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how likely each variation is, up to a factor.
+
+        :param n_variations: how many there are, ordered from the easiest
+        :param progress: of the training, from 0 to 1
+        :param success_rates: running success rate of each variation, NaN where it has not been tried
+        :return: ``(n_variations,)``, non-negative, not all 0
+        """
+
+
+@dataclass(frozen=True)
+class UniformSampler(Sampler):
+    """Every variation is equally likely."""
+
+    def weights(self, n_variations: int, progress: float, success_rates: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See :meth:`Sampler.weights`."""
+        return np.ones(n_variations)
+
+
+@dataclass(frozen=True)
+class CurriculumSampler(Sampler):
+    """Starts with the easiest variation and lets in the others one by one, in order.
+
+    :param fraction: of the training, above 0 and up to 1, after which all of them are in
+    """
+
+    fraction: float = 0.7
+
+    def __post_init__(self) -> None:
+        if not 0 < self.fraction <= 1:
+            raise ValueError(f"fraction={self.fraction} is not accepted; it is above 0 and at most 1")
+
+    def weights(self, n_variations: int, progress: float, success_rates: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See :meth:`Sampler.weights`."""
+        n_in = 1 + int(n_variations * progress / self.fraction)
+        return (np.arange(n_variations) < n_in).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class FailureSampler(Sampler):
+    """The more often a variation fails, the likelier it is.
+
+    :param floor: weight of a variation that never fails, above 0; one that always fails, or is new, has ``1 + floor``
+    """
+
+    floor: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not self.floor > 0:
+            raise ValueError(f"floor={self.floor} is not accepted; it is above 0")
+
+    def weights(self, n_variations: int, progress: float, success_rates: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See :meth:`Sampler.weights`."""
+        return 1 + self.floor - np.nan_to_num(success_rates, nan=0.0)
+
+
+SAMPLERS: dict[str, type[Sampler]] = {
+    "uniform": UniformSampler,
+    "curriculum": CurriculumSampler,
+    "failure": FailureSampler,
+}
+
+
+class TaskDistribution:
+    """The distribution over tasks p(T) of algorithm 1: which variations of an environment to train on.
+
+    .. code-block:: python
+
+        TaskDistribution({"n_discs": [1, 2, 3, 4]})                           # every combination of the values
+        TaskDistribution([{"n_discs": 1}, {"n_discs": 3}], sampler="curriculum")
+        TaskDistribution({"length": lambda rng: rng.uniform(0.3, 1.0)}, apply="attributes")
+
+    :param variations: a mapping from parameter to values (a sequence, a ``range``, or a callable that draws a value
+        from a ``numpy.random.Generator``), of which all combinations are taken; or a sequence of such mappings from
+        parameter to one value, the same parameters in all. Order them from the easiest for a curriculum.
+    :param sampler: ``"uniform"``, ``"curriculum"``, ``"failure"`` or a :class:`Sampler`
+    :param apply: how a variation is put in force: ``"options"`` by ``reset(options=...)``, which the environment must
+        keep in force over the episodes that follow, as all of ``progpolicy_envs`` do; ``"attributes"`` by setting
+        attributes of the environment, ``"constructor"`` by making the environment anew (see
+        :class:`RemakeOnVariation`)
+    :raises ValueError: if there is no variation, a name is not known, or some variations leave a parameter out (which
+        is accepted with ``apply="constructor"`` alone, where it has its default value)
+    """
+
+    #: Weight of the newest episodes in the running success rates.
+    SUCCESS_SMOOTHING = 0.2
+
+    def __init__(
+        self,
+        variations: Mapping[str, Any] | Sequence[Mapping[str, Any]],
+        sampler: str | Sampler = "uniform",
+        apply: Apply = "options",
+    ) -> None:
+        self.variations = _enumerate(variations)
+        if not self.variations:
+            raise ValueError(f"variations={variations!r} is not accepted; at least one variation is needed")
+        if isinstance(sampler, str):
+            if sampler not in SAMPLERS:
+                raise ValueError(f"sampler={sampler!r} is not accepted; known samplers: {', '.join(SAMPLERS)}")
+            sampler = SAMPLERS[sampler]()
+        if apply not in APPLY:
+            raise ValueError(f"apply={apply!r} is not accepted; known: {', '.join(APPLY)}")
+        names = [set(variation) for variation in self.variations]
+        if apply != "constructor" and any(given != names[0] for given in names):
+            left_out = sorted(name for name in set[str]().union(*names) if any(name not in given for given in names))
+            raise ValueError(
+                f"variations={variations!r} is not accepted; some of them leave out {', '.join(left_out)}, which would "
+                "stay what the task before made it. Give every variation a value for it"
+            )
+        self.sampler, self.apply = sampler, apply
+        self.success_rates = np.full(len(self.variations), np.nan)
+
+    def __len__(self) -> int:
+        return len(self.variations)
+
+    def sample(self, rng: np.random.Generator, progress: float = 0.0, n_tasks: int = 1) -> list[tuple[int, Variation]]:
+        """Draw tasks, of different variations as long as the sampler lets in enough of them.
+
+        :param rng: source of all randomness
+        :param progress: of the training, from 0 to 1
+        :param n_tasks: how many, at least 1
+        :return: for each task its index into :attr:`variations` and its variation, every callable in it replaced by a
+            drawn value
+        """
+        weights = self.sampler.weights(len(self), progress, self.success_rates)
+        rounds, indices = weights, list[int]()
+        while len(indices) < n_tasks:
+            if not rounds.any():
+                rounds = weights
+            index = int(rng.choice(len(self), p=rounds / rounds.sum()))
+            indices.append(index)
+            rounds = np.where(np.arange(len(self)) == index, 0, rounds)
+        return [
+            (index, {k: value(rng) if callable(value) else value for k, value in self.variations[index].items()})
+            for index in indices
+        ]
+
+    def record(self, index: int, success: float) -> None:
+        """Update the running success rate of a variation.
+
+        :param index: of the variation
+        :param success: share of its latest episodes that succeeded, 0 to 1
+        """
+        old = self.success_rates[index]
+        smoothing = 1.0 if np.isnan(old) else self.SUCCESS_SMOOTHING
+        self.success_rates[index] = success if smoothing == 1 else old + smoothing * (success - old)
+
+    def label(self, index: int) -> str:
+        """Return a short name of a variation for logs, such as ``n_discs=3``; what all of them share is left out."""
+        variation = self.variations[index]
+        shared = {
+            name
+            for name, value in variation.items()
+            if all(name in other and other[name] == value for other in self.variations)
+        }
+        if len(self) == 1:
+            shared = set()
+        parts = (f"{k}={'drawn' if callable(v) else v}" for k, v in variation.items() if k not in shared)
+        return ",".join(parts) or "default"
+
+    def put_in_force(self, env: VecEnv, variations: Sequence[Variation]) -> None:
+        """Make the variations those that the next reset of ``env`` starts with.
+
+        :param env: the training environments
+        :param variations: one for each environment
+        :raises ValueError: if the environments cannot be varied in this way
+        """
+        if self.apply == "options":
+            env.set_options([dict(variation) for variation in variations])
+            return
+        for row, variation in enumerate(variations):
+            if self.apply == "constructor":
+                _call(env, row, "remake", variation)
+                continue
+            for name, value in variation.items():
+                if not _call(env, row, "set_wrapper_attr", name, value, force=False):
+                    raise ValueError(f"{name!r} is not accepted; the environment has no attribute of this name")
+
+
+def default_tasks(env_id: str | None) -> TaskDistribution:
+    """Return the training variations of a domain, by curriculum, or the environment as it is for any other id.
+
+    :param env_id: environment id; ``None`` where it is not known
+    """
+    domain = DOMAINS.get((env_id or "").rpartition(":")[2])
+    return TaskDistribution([{}]) if domain is None else TaskDistribution(domain.train)
+
+
+class RemakeOnVariation(gym.Wrapper[Any, Any, Any, Any]):
+    """Makes its environment anew, with other constructor arguments, for :class:`TaskDistribution` to call.
+
+    :param env_id: environment id
+    :param kwargs: constructor arguments common to all variations
+    """
+
+    def __init__(self, env_id: str, **kwargs: Any) -> None:
+        self._id, self._kwargs = env_id, kwargs
+        super().__init__(gym.make(env_id, **kwargs))
+
+    def remake(self, variation: Variation) -> None:
+        """Replace the environment.
+
+        :param variation: constructor arguments
+        """
+        remade = gym.make(self._id, **{**self._kwargs, **variation})
+        self.env.close()
+        self.env = remade
+
+
+def _call(env: VecEnv, row: int, method: str, *args: Any, **kwargs: Any) -> Any:
+    if not env.has_attr(method):
+        raise ValueError(
+            f"these environments are not accepted: they have no {method}(). apply='attributes' needs environments that "
+            "are stepped one by one, not a batched one; apply='constructor' needs each wrapped in RemakeOnVariation; "
+            "apply='options' works with all"
+        )
+    return env.env_method(method, *args, indices=[row], **kwargs)[0]
+
+
+def _enumerate(variations: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> list[Variation]:
+    if not isinstance(variations, Mapping):
+        if isinstance(variations, str) or not all(isinstance(variation, Mapping) for variation in variations):
+            raise ValueError(
+                f"variations={variations!r} is not accepted; give a mapping from parameter to values, or a sequence of "
+                "mappings from parameter to one value"
+            )
+        return [dict(variation) for variation in variations]
+    if not variations:
+        return []
+    values = [_values(name, value) for name, value in variations.items()]
+    return [dict(zip(variations, combination, strict=True)) for combination in product(*values)]
+
+
+def _values(name: str, value: Any) -> Sequence[Any]:
+    if callable(value):
+        return [value]
+    if isinstance(value, (str, bytes)) or not isinstance(value, (Sequence, range, np.ndarray)) or not len(value):
+        raise ValueError(f"{name}={value!r} is not accepted; give a non-empty sequence, a range or a callable")
+    return list(value)

@@ -1,0 +1,384 @@
+"""ReptilePPO: algorithm 1 of the paper, Reptile around PPO, with search for a program."""
+
+from __future__ import annotations
+
+import io
+import pathlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from sb3_contrib.ppo_recurrent import MlpLstmPolicy
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
+from stable_baselines3.common.utils import FloatSchedule
+
+from sb3_progpolicy.extraction import env_id_of, extract_program
+from sb3_progpolicy.interaction import program_names
+from sb3_progpolicy.normalization import NormalizingExtractor
+from sb3_progpolicy.policies import ProgrammaticActorCritic, ProgrammaticPolicy, RecurrentProgrammaticPolicy
+from sb3_progpolicy.programs.program import Program
+from sb3_progpolicy.reptile.callback import check_reptile_arguments, start_task
+from sb3_progpolicy.reptile.statistics import EpisodeStatistics
+from sb3_progpolicy.reptile.steps import MetaOptimizer, MetaOptimizerName, Task, begin_task
+from sb3_progpolicy.reptile.tasks import TaskDistribution, default_tasks
+from sb3_progpolicy.reptile_ppo.environments import make_venv, with_history
+from sb3_progpolicy.reptile_ppo.sequence_ppo import SequencePPO
+from sb3_progpolicy.reptile_ppo.theta import Theta
+
+SelfReptilePPO = TypeVar("SelfReptilePPO", bound="ReptilePPO")
+
+
+@dataclass
+class _Learning:
+    """What one call of ``learn`` keeps besides the model."""
+
+    callback: BaseCallback
+    log_interval: int | None = None
+    n_rollouts: int = 0
+    stopped: bool = False
+
+
+class ReptilePPO(SequencePPO):
+    """Reptile + PPO across the variations of a task domain, learning a program (algorithm 1).
+
+    .. code-block:: python
+
+        model = ReptilePPO("ProgPolicy", "Hanoi-v0", verbose=1)
+        model.learn(1_000_000, progress_bar=True)
+        print(model.program())
+
+    What differs from SB3's ``PPO``:
+
+    * tasks are drawn, and after each the initial parameters take a step of Reptile;
+    * the policy also sees its previous action, reward and done flag, and recurrent states survive the end of an
+      episode; they are zeroed at a task switch only (section 2.4);
+    * recurrent policies train on whole rollouts, one unpadded sequence per environment;
+    * while the search goes on, updates alternate between phi, with W frozen, and W, with phi frozen (section 2.3). When
+      ``search_fraction`` of the steps is over the most likely program is extracted (line 10) and phi alone is trained
+      on (lines 11-17).
+
+    :param policy: ``"ProgPolicy"``, ``"PRLPolicy"``, ``"MlpPolicy"``, ``"MlpLstmPolicy"`` or a policy class
+    :param env: an environment id (the fastest vectorised form is built), an environment or a ``VecEnv``
+    :param learning_rate: of the inner updates (Adam), a number or a schedule of the remaining progress; by default 0.01
+        for a program, which is nearly linear in its parameters and takes large steps, and 0.0003 for a network
+    :param n_steps: steps of a rollout, per environment
+    :param batch_size: transitions per gradient step; recurrent policies take ``batch_size / n_steps`` whole sequences,
+        or, where ``batch_size`` is smaller, sequences of ``batch_size`` steps, which must then divide ``n_steps``. By
+        default an eighth of the rollout
+    :param n_epochs: passes over a rollout
+    :param gamma: discount factor
+    :param gae_lambda: of generalised advantage estimation
+    :param clip_range: of the policy ratio, a number or a schedule
+    :param clip_range_vf: of the values, or ``None``
+    :param normalize_advantage: per minibatch
+    :param ent_coef: weight of the action entropy
+    :param vf_coef: weight of the value loss
+    :param max_grad_norm: gradients are clipped to this norm
+    :param target_kl: stop the epochs of an update beyond 1.5 times this divergence; ``None`` for no limit
+    :param tasks: a :class:`TaskDistribution`, or what makes one; by default the domain's training variations
+    :param n_envs: number of environments to build for an id; 32 by default
+    :param env_kwargs: constructor arguments for an id
+    :param inner_updates: k, PPO updates per meta-iteration
+    :param tasks_per_iteration: tasks of a meta-iteration, dealt out over the environments; see :class:`ReptileWrapper`
+    :param meta_learning_rate: beta, a number or a schedule
+    :param meta_optimizer: ``"sgd"`` or ``"adam"``
+    :param meta_update: ``False`` for PPO-N: tasks change, the meta-step is left out
+    :param search_fraction: share of the steps, 0 to 1, after which the program is extracted
+    :param length_coef: price on the expected number of conditions, at least 0; the higher, the shorter the programs
+    :param temperature: of the sigmoid in the soft semantics, a number or a schedule of the remaining progress; ``None``
+        leaves it as the policy has it
+    :param action_std: standard deviation of Box actions, a number or a schedule of the remaining progress; by default
+        PPO learns it. Programs are read and run without noise, but what is learnt under much noise may rely on it: a
+        schedule towards 0 makes the two agree
+    :param interaction_history: append previous action, reward and done to the observation
+    :param normalize_observations: shift and scale observations by running statistics (folded into the program)
+    :param scale_rewards: divide rewards by the running deviation of the return
+    :param stats_window_size: episodes averaged in the logs
+    :param tensorboard_log: folder of the TensorBoard logs
+    :param policy_kwargs: arguments of the policy, such as ``depth``, ``cell`` and ``condition_size``
+    :param verbose: 0, 1 or 2
+    :param seed: of everything random; equal seeds give equal runs
+    :param device: ``"cpu"``, ``"cuda"`` or ``"auto"``; small programs are fastest on the CPU
+    :raises ValueError: if a value, a space or a name is not accepted
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "ProgPolicy": RecurrentProgrammaticPolicy,
+        "PRLPolicy": ProgrammaticPolicy,
+        "MlpPolicy": ActorCriticPolicy,
+        "MlpLstmPolicy": MlpLstmPolicy,
+    }
+
+    def __init__(
+        self,
+        policy: str | type[ActorCriticPolicy],
+        env: GymEnv | str | None,
+        learning_rate: float | Schedule | None = None,
+        n_steps: int = 128,
+        batch_size: int | None = None,
+        n_epochs: int = 10,
+        gamma: float = 0.99,
+        gae_lambda: float = 0.95,
+        clip_range: float | Schedule = 0.2,
+        clip_range_vf: float | Schedule | None = None,
+        normalize_advantage: bool = True,
+        ent_coef: float = 0.01,
+        vf_coef: float = 0.5,
+        max_grad_norm: float = 0.5,
+        target_kl: float | None = None,
+        *,
+        tasks: TaskDistribution | Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
+        n_envs: int | None = None,
+        env_kwargs: Mapping[str, Any] | None = None,
+        inner_updates: int = 4,
+        tasks_per_iteration: int = 4,
+        meta_learning_rate: float | Schedule = 0.5,
+        meta_optimizer: MetaOptimizerName = "sgd",
+        meta_update: bool = True,
+        search_fraction: float = 0.5,
+        length_coef: float = 0.005,
+        temperature: float | Schedule | None = None,
+        action_std: float | Schedule | None = None,
+        interaction_history: bool = True,
+        normalize_observations: bool = False,
+        scale_rewards: bool = False,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        if not 0 <= search_fraction <= 1:
+            raise ValueError(f"search_fraction={search_fraction} is not accepted; it is from 0 to 1")
+        check_reptile_arguments(inner_updates, tasks_per_iteration)
+        self.env_id = env if isinstance(env, str) else env_id_of(env)
+        self.interaction_history = interaction_history
+        venv = None
+        if env is not None:
+            venv = with_history(make_venv(env, n_envs, seed, env_kwargs or {}), interaction_history)
+        if batch_size is None:
+            batch_size = max(2, n_steps * (1 if venv is None else venv.num_envs) // 8)
+        policy_class = self._get_policy_from_name(policy) if isinstance(policy, str) else policy
+        if learning_rate is None:
+            learning_rate = 1e-2 if issubclass(policy_class, ProgrammaticActorCritic) else 3e-4
+        policy_kwargs = dict(policy_kwargs or {})
+        if normalize_observations:
+            policy_kwargs.setdefault("features_extractor_class", NormalizingExtractor)
+        if tasks is None:
+            tasks = default_tasks(self.env_id)
+        self.tasks = tasks if isinstance(tasks, TaskDistribution) else TaskDistribution(tasks)
+        self.inner_updates, self.tasks_per_iteration = inner_updates, tasks_per_iteration
+        self.meta_learning_rate = meta_learning_rate
+        self.meta_optimizer, self.meta_update = meta_optimizer, meta_update
+        self.search_fraction = search_fraction
+        self.normalize_observations = normalize_observations
+        self.input_names: tuple[str, ...] | None = None
+        self.output_names: tuple[str, ...] | None = None
+        if venv is not None:
+            self.input_names, self.output_names = program_names(venv)
+        self.meta_iteration = 0
+        super().__init__(
+            policy,
+            venv,
+            length_coef=length_coef,
+            temperature=temperature,
+            action_std=action_std,
+            scale_rewards=scale_rewards,
+            learning_rate=learning_rate,
+            n_steps=n_steps,
+            batch_size=batch_size,
+            n_epochs=n_epochs,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            clip_range=clip_range,
+            clip_range_vf=clip_range_vf,
+            normalize_advantage=normalize_advantage,
+            ent_coef=ent_coef,
+            vf_coef=vf_coef,
+            max_grad_norm=max_grad_norm,
+            target_kl=target_kl,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=_init_setup_model,
+        )
+
+    def _setup_model(self) -> None:
+        super()._setup_model()  # lines 1-2: the derivation graph, its W at even odds, and phi
+        self.outer_optimizer = MetaOptimizer(self.meta_optimizer)
+
+    # ---------------------------------------------------------------------------------------------- algorithm 1
+
+    def learn(
+        self: SelfReptilePPO,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 1,
+        tb_log_name: str = "ReptilePPO",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfReptilePPO:
+        """Train: algorithm 1. See SB3's ``BaseAlgorithm.learn`` for the arguments.
+
+        :param reset_num_timesteps: ``False`` goes on where training stopped
+        """
+        total_timesteps, callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        self._update_current_progress_remaining(self.num_timesteps, max(1, total_timesteps))
+        learning = _Learning(callback, log_interval)
+        callback.on_training_start(locals(), globals())
+        while self._goes_on(learning) and self._search_goes_on():  # line 3
+            self._meta_iterate(learning)  # lines 4-8
+        if self._goes_on(learning):
+            self._fix_program()  # line 10
+        while self._goes_on(learning):  # line 11
+            self._meta_iterate(learning)  # lines 12-16
+        callback.on_training_end()
+        return self
+
+    def _meta_iterate(self, learning: _Learning) -> None:
+        """Make one meta-iteration: a task, inner updates on it, and a step of the initial parameters."""
+        initial, task, rng = begin_task(  # lines 4 and 12
+            self.policy.parameters(),
+            self.tasks,
+            self.n_envs,
+            n_tasks=self.tasks_per_iteration,
+            number=self.meta_iteration,
+            progress=1 - self._current_progress_remaining,
+            seed=self.seed,
+            rng=self.rng,
+        )
+        self.inner_loop(Theta.of(self), task, rng, learning)  # lines 5-7 and 13-15
+        self.meta_iteration += 1
+        self.logger.record("reptile/meta_iteration", self.meta_iteration)
+        if self.meta_update:
+            beta = FloatSchedule(self.meta_learning_rate)(self._current_progress_remaining)
+            norm = self.outer_optimizer.step(self.policy.parameters(), initial, beta)  # lines 8 and 16
+            self.logger.record("reptile/meta_learning_rate", beta)
+            self.logger.record("reptile/meta_step_norm", norm)
+
+    def inner_loop(
+        self, theta: Theta, task: Task, rng: np.random.Generator, learning: _Learning | None = None
+    ) -> Theta:
+        """Make the inner updates of one task: ``theta`` becomes ``theta_hat`` (lines 5-7).
+
+        The result follows from the arguments and the hyperparameters alone, so that another process can compute it.
+
+        :param theta: where to start
+        :param task: what to train on
+        :param rng: source of randomness in rollouts and updates
+        :param learning: the call of :meth:`learn` that this is a part of; without one nobody is called back
+        :return: theta_hat, which the model holds then, too
+        """
+        if learning is None:
+            _, callback = self._setup_learn(theta.total_timesteps)
+            learning = _Learning(callback)
+        theta.put_into(self)
+        self.rng = rng
+        if self.reward_scaler is not None:
+            self.reward_scaler.reset_returns()
+        start_task(self, self.tasks, task)
+        self._task, self._statistics = task, EpisodeStatistics(self.tasks)
+        assert self.env is not None
+        for number in range(self.inner_updates):
+            if not self.collect_rollouts(self.env, learning.callback, self.rollout_buffer, self.n_steps):  # lines 5-6
+                learning.stopped = True
+                break
+            self._statistics.flush(self.logger)
+            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+            learning.n_rollouts += 1
+            if learning.log_interval is not None and learning.n_rollouts % learning.log_interval == 0:
+                self.dump_logs(learning.n_rollouts)
+            # W and phi in turns (section 2.3), also from one task to the next.
+            odd = (task.number * self.inner_updates + number) % 2 == 1
+            self.train(derivation=self.searching and odd)  # line 7
+            if self.num_timesteps >= self._total_timesteps:
+                break
+        return Theta.of(self)
+
+    def _goes_on(self, learning: _Learning) -> bool:
+        return self.num_timesteps < self._total_timesteps and not learning.stopped
+
+    def _search_goes_on(self) -> bool:
+        searching = self.search is not None and self.search.searching
+        return searching and 1 - self._current_progress_remaining < self.search_fraction
+
+    def _fix_program(self) -> None:
+        """Select the most likely program; from here on phi alone is trained (line 10)."""
+        if self.search is None or not self.search.searching:
+            return
+        self.search.select(self.search.most_likely())
+        names = [name for name, _ in self.policy.named_parameters()]
+        self.outer_optimizer.drop(names.index("module.search.logits"))
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Any = None) -> None:
+        super()._update_info_buffer(infos, dones)
+        self._statistics.add(self._task.indices, dones, infos)
+
+    # --------------------------------------------------------------------------------------------- the program
+
+    def program(self, **metadata: Any) -> Program:
+        """Return the most likely program as plain data, its inputs and outputs named by the environment.
+
+        :param metadata: JSON values to keep with it; environment id, seed and number of steps are put in
+        :raises TypeError: if the policy is not a program
+        """
+        return extract_program(self, **metadata)
+
+    # ------------------------------------------------------------------------------------------- save and load
+
+    @classmethod
+    def load(
+        cls: type[SelfReptilePPO],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | str | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfReptilePPO:
+        """Load a model. See SB3's ``BaseAlgorithm.load``.
+
+        :param env: an environment id is accepted too; what the policy sees of its interaction is appended as it was
+            in training
+        """
+        if env is not None:
+            data, _, _ = load_from_zip_file(path, device=device, custom_objects=custom_objects)
+            if isinstance(path, io.BufferedIOBase):
+                path.seek(0)
+            assert data is not None
+            n_envs = data["n_envs"] if isinstance(env, str) else None
+            env = with_history(make_venv(env, n_envs, data["seed"], {}), data["interaction_history"])
+        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """Set the environment, and append the interaction history to its observations if the policy reads it."""
+        super().set_env(with_history(make_venv(env, None, None, {}), self.interaction_history), force_reset)
+
+    def set_parameters(
+        self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        """Load parameters. See SB3's ``BaseAlgorithm.set_parameters``."""
+        if isinstance(load_path_or_dict, dict) and "reptile.meta_optimizer" in load_path_or_dict:  # of release 0.1
+            renamed: Any = dict(load_path_or_dict)
+            renamed["outer_optimizer"] = renamed.pop("reptile.meta_optimizer")
+            load_path_or_dict = renamed
+        super().set_parameters(load_path_or_dict, exact_match, device)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "outer_optimizer", "_task", "_statistics"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "policy.optimizer", "outer_optimizer"], []

@@ -1,0 +1,48 @@
+"""The environments of ReptilePPO: made from an id, and with the interaction history appended."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from stable_baselines3 import PPO
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
+
+from sb3_progpolicy.interaction import InteractionHistory, VecInteractionHistory
+from sb3_progpolicy.vec_env import make_fast_vec_env
+
+DEFAULT_N_ENVS = 32
+
+
+def make_venv(env: GymEnv | str, n_envs: int | None, seed: int | None, env_kwargs: Mapping[str, Any]) -> VecEnv:
+    """Return the environments of an id in their fastest form, or those given as a ``VecEnv``.
+
+    :param env: an id, an environment or a ``VecEnv``
+    :param n_envs: how many to make of an id; :data:`DEFAULT_N_ENVS` by default
+    :param seed: of the environments of an id
+    :param env_kwargs: constructor arguments for an id
+    :raises ValueError: for ``n_envs`` or ``env_kwargs`` with an environment that is made already
+    """
+    if isinstance(env, str):
+        return make_fast_vec_env(env, DEFAULT_N_ENVS if n_envs is None else n_envs, seed, **env_kwargs)
+    if n_envs is not None or env_kwargs:
+        raise ValueError("n_envs and env_kwargs are for environment ids; the environment given is already made")
+    return PPO._wrap_env(env)
+
+
+def with_history(venv: VecEnv, interaction_history: bool) -> VecEnv:
+    """Append the interaction history, if asked for and not there yet.
+
+    :param venv: environments
+    :param interaction_history: whether the policy reads it
+    :raises ValueError: if a single environment is wrapped in :class:`InteractionHistory`
+    """
+    if interaction_history and any(venv.env_is_wrapped(InteractionHistory)):
+        raise ValueError(
+            "an environment wrapped in InteractionHistory is not accepted; ReptilePPO appends the history itself. "
+            "Give it the environment without the wrapper, or interaction_history=False"
+        )
+    if interaction_history and not is_vecenv_wrapped(venv, VecInteractionHistory):
+        return VecInteractionHistory(venv)
+    return venv

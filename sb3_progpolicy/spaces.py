@@ -1,0 +1,121 @@
+"""Action and observation spaces as numbers: how an action is described, and how the input X of section 2.4 is made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import DTypeLike, NDArray
+
+ActionKind = Literal["discrete", "box", "multi_discrete", "multi_binary"]
+
+
+@dataclass(frozen=True)
+class ActionSpec:
+    """The action space that a program acts in.
+
+    :param kind: which Gymnasium space
+    :param sizes: ``(n,)`` for Discrete, the ``nvec`` of a MultiDiscrete, ``(n,)`` for MultiBinary, the flat size of a
+        Box; a controller has ``sum(sizes)`` outputs
+    :param low: lower bounds of a Box, one per number; empty otherwise
+    :param high: upper bounds of a Box; empty otherwise
+    :param start: first action of a Discrete space
+    """
+
+    kind: ActionKind
+    sizes: tuple[int, ...]
+    low: tuple[float, ...] = ()
+    high: tuple[float, ...] = ()
+    start: int = 0
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs of every controller."""
+        return sum(self.sizes)
+
+    @property
+    def history_size(self) -> int:
+        """Width of the previous action in X: one-hot for discrete spaces, the numbers themselves otherwise."""
+        return sum(self.sizes)
+
+    @property
+    def interaction_size(self) -> int:
+        """Width of what X holds after the observation: previous action, previous reward, previous done flag."""
+        return self.history_size + 2
+
+
+def action_spec(space: spaces.Space[Any]) -> ActionSpec:
+    """Describe an action space as plain data.
+
+    :param space: Discrete, Box, MultiDiscrete or MultiBinary
+    :raises ValueError: for any other space
+    """
+    if isinstance(space, spaces.Discrete):
+        return ActionSpec("discrete", (int(space.n),), start=int(space.start))
+    if isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim == 1 and not space.start.any():
+        return ActionSpec("multi_discrete", tuple(int(n) for n in space.nvec))
+    if isinstance(space, spaces.MultiBinary) and isinstance(space.n, (int, np.integer)):
+        return ActionSpec("multi_binary", (int(space.n),))
+    if isinstance(space, spaces.Box):
+        low, high = (tuple(bound.astype(float).ravel().tolist()) for bound in (space.low, space.high))
+        return ActionSpec("box", (len(low),), low=low, high=high)
+    raise ValueError(
+        f"action space {space} is not accepted; programs act in Discrete, Box and one-dimensional MultiDiscrete "
+        "(starting at 0) and MultiBinary spaces"
+    )
+
+
+def check_observation_space(space: spaces.Space[Any]) -> spaces.Box:
+    """Return an observation space that a program can read.
+
+    :param space: a one-dimensional Box
+    :raises ValueError: for any other space; ``gymnasium.wrappers.FlattenObservation`` makes it fit
+    """
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise ValueError(
+            f"observation space {space} is not accepted; programs read one-dimensional Box observations. "
+            "Wrap the environment in gymnasium.wrappers.FlattenObservation"
+        )
+    return space
+
+
+def interaction_space(observation_space: spaces.Space[Any], spec: ActionSpec) -> spaces.Box:
+    """Return the space of X = [observation, previous action, previous reward, previous done].
+
+    :param observation_space: a one-dimensional Box
+    :param spec: the action space
+    :raises ValueError: for any other observation space
+    """
+    observation_space = check_observation_space(observation_space)
+    if spec.kind == "box":
+        low, high = (np.asarray(bound, dtype=np.float32) for bound in (spec.low, spec.high))
+    else:
+        low, high = np.zeros(spec.history_size, np.float32), np.ones(spec.history_size, np.float32)
+    unbounded = np.finfo(np.float32).max
+    # Before the first action all its numbers are zero, whatever the bounds.
+    return spaces.Box(
+        np.concatenate((observation_space.low, np.minimum(low, 0), [-unbounded, 0])).astype(np.float32),
+        np.concatenate((observation_space.high, np.maximum(high, 0), [unbounded, 1])).astype(np.float32),
+        dtype=np.float32,
+    )
+
+
+def encode_actions(actions: NDArray[Any], spec: ActionSpec, dtype: DTypeLike = np.float32) -> NDArray[Any]:
+    """Encode actions for X: one-hot for Discrete and MultiDiscrete, the numbers themselves otherwise.
+
+    :param actions: ``(n_envs, *action_shape)``, each in the action space
+    :param spec: the action space
+    :param dtype: of the result
+    :return: ``(n_envs, spec.history_size)``
+    """
+    n_envs = len(actions)
+    if spec.kind in ("box", "multi_binary"):
+        return actions.reshape(n_envs, -1).astype(dtype)
+    encoded = np.zeros((n_envs, spec.history_size), dtype=dtype)
+    columns = actions.reshape(n_envs, -1) - spec.start
+    if len(spec.sizes) > 1:
+        columns = columns + np.concatenate(([0], np.cumsum(spec.sizes)[:-1]))
+    encoded[np.arange(n_envs)[:, None], columns] = 1
+    return encoded
