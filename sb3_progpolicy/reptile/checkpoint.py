@@ -5,14 +5,11 @@ from __future__ import annotations
 import io
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_progpolicy.programs.files import write_atomically
-
-if TYPE_CHECKING:
-    from sb3_progpolicy.reptile_ppo import ReptilePPO
 
 
 class ReptileCheckpoint(BaseCallback):
@@ -28,7 +25,7 @@ class ReptileCheckpoint(BaseCallback):
     :raises ValueError: if ``save_freq`` is negative
     """
 
-    model: ReptilePPO
+    model: Any  # a ReptilePPO
 
     def __init__(self, path: str | os.PathLike[str], save_freq: int = 0, verbose: int = 0) -> None:
         super().__init__(verbose)
