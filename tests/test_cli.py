@@ -143,12 +143,6 @@ def test_render_writes_a_film(tmp_path):
     assert list(tmp_path.iterdir()) == [film]
 
 
-def test_envs_lists_parameters_and_variations(capsys):
-    assert run(["envs"]) == 0
-    out = capsys.readouterr().out
-    assert all(word in out for word in ("Hanoi-v0", "n_discs", "unseen"))
-
-
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

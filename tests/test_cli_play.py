@@ -16,7 +16,6 @@ from sb3_progpolicy.cli import run
 from sb3_progpolicy.cli.playing import action_keys
 
 PLANNING = [domain.id for domain in DOMAINS.values() if not domain.simulation]
-SIMULATIONS = [domain.id for domain in DOMAINS.values() if domain.simulation]
 
 
 @pytest.fixture

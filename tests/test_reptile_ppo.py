@@ -17,6 +17,7 @@ from sb3_progpolicy.programs import ProgramRunner
 from sb3_progpolicy.vec_env import make_fast_vec_env
 
 POLICIES = ("ProgPolicy", "PRLPolicy", "MlpPolicy", "MlpLstmPolicy")
+PARTS_OF_LOSS = ("loss", "policy_gradient_loss", "entropy_loss", "value_loss")
 
 
 def make(policy="ProgPolicy", env="Hanoi-v0", **kwargs):
@@ -71,7 +72,7 @@ class OneStep(gym.Env):
 def test_hidden_state_survives_episode_end_but_not_task_switch(policy):
     kwargs = {"n_steps": 8, "batch_size": 16, "inner_updates": 2, "search_fraction": 1.0}
     model = make(policy, DummyVecEnv([OneStep] * 2), **kwargs)
-    at_start, after_step = [], []
+    at_start = []
 
     class Watch(BaseCallback):
         def _on_rollout_start(self):
@@ -79,7 +80,6 @@ def test_hidden_state_survives_episode_end_but_not_task_switch(policy):
 
         def _on_step(self):
             assert self.locals["dones"].all()
-            after_step.append(self.model._present_states().pi[0].clone())
             return True
 
     model.learn(64, callback=Watch())
@@ -88,7 +88,7 @@ def test_hidden_state_survives_episode_end_but_not_task_switch(policy):
     buffer = model.rollout_buffer
     x = th.as_tensor(buffer.observations.reshape(8, 2, -1)[-1])
     alone = model.policy.predict(x.numpy(), None)[1][0]
-    assert np.abs(after_step[-1].numpy() - alone).max() > 1e-4
+    assert np.abs(model._last_lstm_states.pi[0].numpy() - alone).max() > 1e-4
 
 
 def log_ratios(model):
@@ -113,6 +113,7 @@ def log_ratios(model):
 
     model.train = train
     model.learn(2 * model.n_steps * model.n_envs)
+    assert sum(len(ratio) for ratio, _ in captured) == 2 * model.n_steps * model.n_envs
     return captured
 
 
@@ -128,9 +129,7 @@ def log_ratios(model):
 )
 def test_first_epoch_starts_at_the_log_probabilities_of_the_rollout(policy, policy_kwargs, env_id, batch_size):
     model = make(policy, env_id, n_steps=32, batch_size=batch_size, n_epochs=1, policy_kwargs=policy_kwargs)
-    captured = log_ratios(model)
-    assert sum(len(ratio) for ratio, _ in captured) == 2 * 32 * 4
-    for ratio, values in captured:
+    for ratio, values in log_ratios(model):
         assert ratio.abs().max() < 1e-5
         assert values.abs().max() < 1e-4
 
@@ -249,19 +248,16 @@ def test_recurrence_stays_block_diagonal_in_training(meta_optimizer, beta):
     assert (conditions.rnn.weight_hh_l0 != before)[mask == 1].any()
 
 
-def test_price_on_length_adds_the_expected_number_of_conditions_to_the_loss():
-    model = make(learning_rate=0.0).learn(64)
+@pytest.mark.parametrize("length_coef", [0.0, 0.7])
+def test_price_on_length_adds_the_expected_number_of_conditions_to_the_loss(length_coef):
+    model = make(learning_rate=0.0, length_coef=length_coef, ent_coef=0.1, vf_coef=0.3)
     with th.no_grad():
         model.search.logits.copy_(th.tensor([[0.0, 1.0], [0.5, 0.0]]))
-    rollout, gradients, losses = model._sequences(), [], []
-    for length_coef in (0.0, 0.7):
-        model.length_coef = length_coef
-        loss, _ = model._loss(rollout, np.arange(4), 0.2)
-        losses.append(loss.item())
-        gradients.append(th.autograd.grad(loss, model.search.logits)[0])
-    price = 0.7 * model.search.expected_conditions()
-    assert losses[1] - losses[0] == pytest.approx(price.item(), abs=1e-5)
-    th.testing.assert_close(gradients[1] - gradients[0], th.autograd.grad(price, model.search.logits)[0])
+    model.learn(64)
+    logged = {name: model.logger.name_to_value[f"train/{name}"] for name in PARTS_OF_LOSS}
+    without = logged["policy_gradient_loss"] + 0.1 * logged["entropy_loss"] + 0.3 * logged["value_loss"]
+    price = length_coef * model.search.expected_conditions().item()
+    assert logged["loss"] - without == pytest.approx(price, abs=1e-5)
 
 
 def test_high_price_on_length_leaves_a_program_without_conditions():
@@ -317,7 +313,7 @@ def test_all_action_spaces_and_double_precision_observations(space, interaction_
     env = DummyVecEnv([lambda: OneStep(space)] * 4)
     model = make(env=env, interaction_history=interaction_history, policy_kwargs={"cell": cell}).learn(128)
     env = VecInteractionHistory(env) if interaction_history else env
-    assert evaluate_policy(model, env, 8, warn=False)[0] == 0.0
+    evaluate_policy(model, env, 8, warn=False)  # the environment asserts that actions are in its space
     assert model.program().action.n_outputs == sum(model.policy.spec_of_actions.sizes)
 
 
@@ -412,8 +408,10 @@ def test_saved_and_loaded_model_is_the_same_and_trains_on(policy, tmp_path):
     assert th.equal(weights(loaded), weights(model))
 
 
-def test_model_without_an_environment_predicts():
-    model = make().learn(64)
+def test_model_without_an_environment_predicts(tmp_path):
+    make().learn(64).save(tmp_path / "model")
+    model = ReptilePPO.load(tmp_path / "model")
+    assert model.get_env() is None
     states, observation = None, np.ones(17, np.float32)
     for start in (True, False, True):
         action, states = model.predict(observation, states, np.array([start]), deterministic=True)
@@ -463,9 +461,9 @@ def test_everything_that_is_promised_is_logged(tmp_path):
     label = model.tasks.label(0)
     promised = {f"success/{label}", f"steps/{label}", "reptile/meta_step_norm", "program/search_entropy"}
     promised |= {f"program/prob_{n}_conditions" for n in range(3)}
+    promised |= {f"program/branch_{name}" for name in ("then_1", "then_2", "last_1", "last_2", "last_3")}
     promised |= {"train/approx_kl", "train/value_loss", "rollout/ep_len_mean", "time/total_timesteps"}
     assert promised <= keys
-    assert any(key.startswith("program/") and ("branch" in key or "taken" in key) for key in keys)
 
 
 def test_tensorboard_progress_bar_and_callbacks_work_as_in_sb3(tmp_path):
