@@ -13,6 +13,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_progpolicy import InteractionHistory, ReptilePPO, VecInteractionHistory
+from sb3_progpolicy.normalization import RewardScaler
 from sb3_progpolicy.programs import ProgramRunner
 from sb3_progpolicy.vec_env import make_fast_vec_env
 
@@ -211,6 +212,30 @@ def test_updates_move_phi_and_w_in_turns(n_epochs, batch_size):
     assert moves == ([["phi"]] * steps_per_update + [["W"]] * steps_per_update) * 2
 
 
+def test_target_kl_ends_the_epochs_of_an_update():
+    model, n_steps = make("MlpPolicy", target_kl=1e-9, learning_rate=0.01), []
+    step = model.policy.optimizer.step
+
+    def watched():
+        step()
+        n_steps.append(model.num_timesteps)
+
+    model.policy.optimizer.step = watched
+    model.learn(64 * 3)
+    # The first step starts at the policy of the rollout, the second would start away from it.
+    assert n_steps == [64, 128, 192]
+
+
+@pytest.mark.parametrize("clip_range_vf", [None, 1e-9])
+def test_values_move_no_further_than_their_clip_range(clip_range_vf):
+    def critic(n_epochs):
+        kwargs = {"optimizer_class": th.optim.SGD}
+        model = make("MlpPolicy", clip_range_vf=clip_range_vf, n_epochs=n_epochs, batch_size=64, policy_kwargs=kwargs)
+        return model.learn(64).policy.value_net.bias
+
+    assert bool(critic(1) == critic(3)) == (clip_range_vf is not None)
+
+
 @pytest.mark.parametrize("meta_optimizer", ["sgd", "adam"])
 def test_after_the_search_the_likeliest_program_is_selected_and_w_stands_still(meta_optimizer):
     seen = []
@@ -270,6 +295,7 @@ def test_temperature_follows_its_schedule():
     model = make(temperature=lambda left: 0.1 + left)
     model.learn(64 * 4, callback=Each(lambda m, _: temperatures.append(float(m.policy.module.temperature))))
     assert sorted(set(temperatures), reverse=True) == pytest.approx([1.1, 0.85, 0.6, 0.35])
+    assert model.program().temperature == pytest.approx(0.35)
 
 
 @pytest.mark.parametrize("policy", POLICIES)
@@ -441,6 +467,18 @@ def test_scaled_rewards_are_trained_on_and_true_ones_are_seen():
     assert (np.abs(scaled) < np.abs(raw)).all()
     x = model.rollout_buffer.observations.reshape(16, 4, -1)
     np.testing.assert_allclose(x[1:, :, -2], raw[:-1], rtol=1e-5)
+
+
+def test_returns_by_which_rewards_are_scaled_start_anew_with_a_task():
+    model, expected = make(env="Pendulum-v1", scale_rewards=True, inner_updates=1), RewardScaler(0.99)
+
+    def take_in(_, local):
+        last = (model.num_timesteps // 4) % model.n_steps == 0
+        expected(local["rewards"].copy(), np.full(4, last))
+
+    model.learn(64 * 3, callback=Each(take_in))
+    assert model.reward_scaler.statistics.mean == pytest.approx(expected.statistics.mean)
+    assert model.reward_scaler.statistics.var == pytest.approx(expected.statistics.var)
 
 
 def test_program_has_the_names_of_the_environment():
