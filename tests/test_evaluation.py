@@ -1,10 +1,11 @@
+from dataclasses import replace
+
 import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
 from sb3_progpolicy import ReptilePPO, evaluate_model, evaluate_program
-from sb3_progpolicy import evaluation as module
 from tests.handwritten.hanoi import hanoi_program
 
 SIZES = [{"n_discs": n_discs} for n_discs in range(1, 6)]
@@ -31,18 +32,21 @@ def untrained():
     return ReptilePPO("ProgPolicy", "Hanoi-v0", n_envs=2, n_steps=8, seed=1, policy_kwargs={"condition_size": 3})
 
 
-def test_batched_and_single_environments_give_the_same_rows(untrained, monkeypatch):
+@pytest.fixture
+def unbatched():
+    """Hanoi registered without its vectorised form."""
+    gym.register("UnbatchedHanoi-v0", gym.spec("Hanoi-v0").entry_point, max_episode_steps=500)
+    yield "UnbatchedHanoi-v0"
+    del gym.registry["UnbatchedHanoi-v0"]
+
+
+def test_batched_and_single_environments_give_the_same_rows(untrained, unbatched):
     variations = [{"n_discs": 1, "source": source, "target": "random"} for source in (0, 1, 2, 1)]
-    batched = evaluate_program(untrained.program(), None, variations, 6, seed=3, max_steps=40)
-
-    def single(env_id, n_envs, seed=None, **kwargs):
-        return module.make_vec_env(env_id, n_envs=n_envs, seed=seed, env_kwargs=kwargs)
-
-    from stable_baselines3.common.env_util import make_vec_env
-
-    monkeypatch.setattr(module, "make_vec_env", make_vec_env, raising=False)
-    monkeypatch.setattr(module, "make_fast_vec_env", single)
-    assert evaluate_program(untrained.program(), None, variations, 6, seed=3, max_steps=40) == batched
+    batched, single = (
+        evaluate_program(untrained.program(), env_id, variations, 6, seed=3, max_steps=40)
+        for env_id in ("Hanoi-v0", unbatched)
+    )
+    assert [replace(row, env="Hanoi-v0") for row in single] == batched
     assert 0 < np.mean([row.success_rate for row in batched]) < 1
 
 

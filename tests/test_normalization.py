@@ -82,6 +82,8 @@ def test_a_new_task_starts_new_returns_and_keeps_the_statistics():
     variance, count = float(scaler.statistics.var), scaler.statistics.count
     scaler.reset_returns()
     assert float(scaler.statistics.var) == variance
-    scaler(np.array([1.0]), np.zeros(1, bool))
-    np.testing.assert_allclose(scaler._returns, [1.0])
-    assert scaler.statistics.count == count + 1
+    mean = float(scaler.statistics.mean)
+    scaler(np.array([1.0, 5.0]), np.zeros(2, bool))
+    # Two returns more, which are the rewards themselves.
+    assert scaler.statistics.count == count + 2
+    assert float(scaler.statistics.mean) == pytest.approx((mean * count + 1 + 5) / (count + 2))

@@ -6,6 +6,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from sb3_contrib import RecurrentPPO
+from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -133,11 +134,12 @@ def test_state_is_zeroed_at_episode_starts_where_asked_for(cell):
 def test_gradients_flow_through_time_where_states_are_zeroed_at_episode_starts(cell):
     kwargs = {"cell": cell, "reset_state_at_episode_start": True}
     policy = make(RecurrentPPO, RecurrentProgrammaticPolicy, "CartPole-v1", policy_kwargs=kwargs).policy
-    features = th.randn(6, 4, requires_grad=True)
-    zero = th.zeros(1, 1, policy.module.conditions.hidden_size)
-    values, _ = policy._condition_values(features, (zero, zero), th.tensor([1.0, 0, 0, 1.0, 0, 0]))
-    values[-1].sum().backward()
-    reached = features.grad.abs().sum(1) > 0
+    observations = th.randn(6, 4, requires_grad=True)
+    zero = policy.module.initial_state(1)
+    starts = th.tensor([1.0, 0, 0, 1.0, 0, 0])
+    _, log_probs, _ = policy.evaluate_actions(observations, th.zeros(6), RNNStates(zero, zero), starts)
+    log_probs[-1].backward()
+    reached = observations.grad.abs().sum(1) > 0
     assert reached.tolist() == [False] * 3 + [True] * 3
 
 

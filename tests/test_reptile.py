@@ -1,7 +1,5 @@
 """Reptile with stock algorithms: the update, its schedule, and what a task switch does."""
 
-import itertools
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -46,36 +44,53 @@ def flat(model):
     return th.nn.utils.parameters_to_vector(model.policy.parameters()).detach().clone()
 
 
-class Record(ReptileWrapper):
-    """Keeps theta, theta_hat, beta, the new theta and the length of every meta-step."""
+class Starts(BaseCallback):
+    """Parameters, and what is logged, at the start of every rollout and at the end of the training."""
 
-    def _on_training_start(self):
-        super()._on_training_start()
-        self.records = []
+    def __init__(self):
+        super().__init__()
+        self.seen = []
 
-    def _meta_step(self):
-        theta, theta_hat = th.cat([parameter.flatten() for parameter in self._theta]), flat(self.model)
-        super()._meta_step()
-        logged = (self.logger.name_to_value[f"reptile/{name}"] for name in ("meta_learning_rate", "meta_step_norm"))
-        beta, norm = logged
-        self.records.append((theta, theta_hat, beta, flat(self.model), norm))
+    def _on_rollout_start(self):
+        self.seen.append((flat(self.model), dict(self.logger.name_to_value)))
+
+    _on_training_end = _on_rollout_start
+
+    def _on_step(self):
+        return True
+
+
+def learn(model, n_tasks, inner_updates, reptile=None):
+    """Train; return theta, theta_hat, the next theta, and the logged beta and norm of every meta-step."""
+    starts, ends, train = Starts(), [], model.train
+
+    def watched(**arguments):
+        train(**arguments)
+        ends.append(flat(model))
+
+    model.train = watched
+    callbacks = [starts] if reptile is None else [reptile, starts]
+    model.learn(n_tasks * inner_updates * model.n_steps * model.n_envs, callbacks)
+    seen, ends = starts.seen[::inner_updates], ends[inner_updates - 1 :: inner_updates]
+    assert len(seen) == n_tasks + 1
+    return [
+        (theta, theta_hat, new, logged["reptile/meta_learning_rate"], logged["reptile/meta_step_norm"])
+        for (theta, _), theta_hat, (new, logged) in zip(seen[:-1], ends, seen[1:], strict=True)
+    ]
 
 
 @pytest.mark.parametrize(("algorithm", "policy"), [(PPO, "MlpPolicy"), (RecurrentPPO, "MlpLstmPolicy")])
 def test_meta_step_goes_from_theta_towards_theta_hat(algorithm, policy):
-    model = make(algorithm, policy)
-    reptile = Record(by_attribute(), inner_updates=2, meta_learning_rate=0.25)
-    model.learn(96, callback=reptile)
-    assert len(reptile.records) == reptile.meta_iteration == 3
-    for theta, theta_hat, beta, new, norm in reptile.records:
+    options = {"inner_updates": 2, "meta_learning_rate": 0.25}
+    if algorithm is ReptilePPO:
+        tasks = learn(make(algorithm, policy, tasks=by_attribute(), interaction_history=False, **options), 3, 2)
+    else:
+        tasks = learn(make(algorithm, policy), 3, 2, ReptileWrapper(by_attribute(), **options))
+    for theta, theta_hat, new, beta, norm in tasks:
         assert beta == 0.25
         assert (theta_hat - theta).norm() > 1e-4
         th.testing.assert_close(new, theta + 0.25 * (theta_hat - theta))
         assert norm == pytest.approx(float((new - theta).norm()), rel=1e-4)
-    # Each task starts where the meta-step led.
-    for before, after in itertools.pairwise(reptile.records):
-        th.testing.assert_close(after[0], before[3], rtol=0, atol=0)
-    th.testing.assert_close(flat(model), reptile.records[-1][3], rtol=0, atol=0)
 
 
 def test_callback_of_one_model_trains_a_second_one_afresh():
@@ -97,11 +112,11 @@ def test_algorithm_with_reptile_built_in_is_refused():
 
 
 def test_adam_steps_on_the_pseudo_gradient():
-    reptile = Record(by_attribute(), inner_updates=1, meta_learning_rate=0.02, meta_optimizer="adam")
-    make().learn(80, callback=reptile)
-    parameter = th.nn.Parameter(reptile.records[0][0].clone())
+    reptile = ReptileWrapper(by_attribute(), inner_updates=1, meta_learning_rate=0.02, meta_optimizer="adam")
+    tasks = learn(make(), 5, 1, reptile)
+    parameter = th.nn.Parameter(tasks[0][0].clone())
     optimizer = th.optim.Adam([parameter], lr=0.02)
-    for theta, theta_hat, _, new, _ in reptile.records:
+    for theta, theta_hat, new, *_ in tasks:
         th.testing.assert_close(parameter.detach(), theta)
         parameter.grad = theta - theta_hat
         optimizer.step()
@@ -140,9 +155,8 @@ def test_reptile_contracts_by_the_rate_of_the_formula():
 
 
 def test_meta_learning_rate_follows_its_schedule():
-    reptile = Record(by_attribute(), 1, meta_learning_rate=lambda left: 0.8 * left)
-    make(Descent).learn(4 * 16, callback=reptile)
-    assert [record[2] for record in reptile.records] == pytest.approx([0.6, 0.4, 0.2, 0.0])
+    tasks = learn(make(Descent), 4, 1, ReptileWrapper(by_attribute(), 1, meta_learning_rate=lambda left: 0.8 * left))
+    assert [beta for *_, beta, _ in tasks] == pytest.approx([0.6, 0.4, 0.2, 0.0])
 
 
 class Watch(BaseCallback):
@@ -189,12 +203,12 @@ def test_tasks_and_training_follow_from_the_seed():
 
 
 def test_a_second_training_starts_at_the_beginning_of_the_curriculum():
-    tasks = by_attribute(sampler="curriculum")
+    tasks = TaskDistribution({"length": [0.1, 0.2, 0.3, 0.4, 0.5]}, sampler="curriculum", apply="attributes")
     model, watch = make(), Watch()
     reptile = ReptileWrapper(tasks, 1)
     model.learn(160, callback=reptile)
     model.learn(160, callback=[reptile, watch])
-    assert watch.lengths[0] == [LENGTHS[0]] * 2
+    assert watch.lengths[0] == [0.1] * 2
 
 
 def test_success_and_length_of_episodes_are_logged_per_variation():

@@ -136,6 +136,24 @@ def test_checkpoint_written_in_the_middle_of_a_task_holds_its_start(tmp_path):
     assert (loaded.meta_iteration, loaded.num_timesteps) == (2, 8 * 16 * 4)
 
 
+@pytest.mark.parametrize("writer", ["model", "checkpoint"])
+def test_save_that_fails_leaves_the_old_file_and_no_other(writer, tmp_path, monkeypatch):
+    path = tmp_path / "model.zip"
+    checkpoint = ReptileCheckpoint(path)
+    model = ReptilePPO("ProgPolicy", "Hanoi-v0", n_envs=2, n_steps=16, inner_updates=1).learn(64, checkpoint)
+    before = path.read_bytes()
+
+    def fail(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", fail)
+    save = checkpoint.save if writer == "checkpoint" else lambda: model.save(path)
+    with pytest.raises(OSError, match="disk full"):
+        save()
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == [path.name]
+
+
 def test_checkpoint_without_a_boundary_writes_nothing(tmp_path):
     assert not ReptileCheckpoint(tmp_path / "model.zip").save()
     assert not list(tmp_path.iterdir())

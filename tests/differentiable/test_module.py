@@ -7,9 +7,8 @@ import pytest
 import torch as th
 from torch import nn
 
-from progpolicy_envs.hanoi import HanoiVectorEnv
 from sb3_progpolicy.differentiable.module import Conditions, ProgramModule
-from sb3_progpolicy.programs import ActionSpec, Program, ProgramRunner, export_python
+from sb3_progpolicy.programs import ActionSpec, Program, ProgramRunner
 
 CELLS = ("affine", "rnn", "gru", "lstm")
 ACTIONS = {
@@ -175,50 +174,6 @@ def test_towards_temperature_zero_the_soft_program_is_the_crisp_one(cell):
         distances.append((soft - crisp).abs().max().item())
     assert distances[0] > distances[1] > distances[2]
     assert distances[2] < 1e-5
-
-
-def play_hanoi(module, n_steps):
-    """Let a program play, drawing from its mixture; return X of every step, per sequence."""
-    envs = HanoiVectorEnv(8, source="random", target="random", max_episode_steps=200)
-    observations, _ = envs.reset(seed=0, options={"n_discs": list(range(1, 9))})
-    history, state = np.zeros((8, 8), np.float32), module.initial_state(8)
-    recorded = []
-    for _ in range(n_steps):
-        x = np.concatenate((observations, history), axis=1)
-        recorded.append(x)
-        with th.no_grad():
-            logits, state = module(th.from_numpy(x)[None], state)
-        actions = th.distributions.Categorical(logits=logits[0]).sample().numpy()
-        observations, rewards, terminated, truncated, _ = envs.step(actions)
-        history = np.column_stack((np.eye(6)[actions], rewards, terminated | truncated)).astype(np.float32)
-    return np.stack(recorded)
-
-
-@pytest.mark.parametrize("cell", CELLS)
-def test_exported_python_acts_as_the_crisp_torch_program_on_ten_thousand_hanoi_states(cell):
-    th.manual_seed(3)
-    module = ProgramModule(17, ActionSpec("discrete", (6,)), 4, cell, 3)
-    with th.no_grad():
-        module.controllers.weight.normal_()
-        if module.conditions.recurrent:
-            module.conditions.readout.normal_(std=3)
-            # Off-centre, so that all branches are taken.
-            module.conditions.readout_bias.copy_(th.tensor([-0.5, 0.0, 0.5]))
-    recorded = play_hanoi(module, 1250)  # 10 000 states of 1 to 8 discs
-    extracted = module.extract(3)
-    with th.no_grad():
-        expected = extracted(th.from_numpy(recorded), extracted.initial_state(8), crisp=True)[0].argmax(-1).numpy()
-        tests, _ = extracted.conditions(th.from_numpy(recorded), extracted.initial_state(8))
-    assert all(len(np.unique(tests[..., k].numpy() >= 0)) == 2 for k in range(3)), "a branch is never taken"
-    names = tuple(f"x{i}" for i in range(17))
-    program = Program(module.to_syntax(3), 9, module.action, True, names, tuple("abcdef"))
-    namespace = {}
-    exec(compile(export_python(program), "exported.py", "exec"), namespace)
-    for row in range(8):
-        policy = namespace["ProgramPolicy"]()
-        for x, wanted in zip(recorded[:, row].astype(float), expected[:, row], strict=True):
-            previous = int(x[9:15].argmax()) if x[9:15].any() else None
-            assert policy.act(x[:9].tolist(), previous, x[15], bool(x[16])) == wanted
 
 
 def block_mask(conditions):
