@@ -249,7 +249,7 @@ class ReptilePPO(SequencePPO):
 
     def _meta_iterate(self, learning: _Learning) -> None:
         """Make one meta-iteration: a task, inner updates on it, and a step of the initial parameters."""
-        initial, task, rng = begin_task(  # lines 4 and 12
+        theta, task, rng = begin_task(  # lines 4 and 12
             self.policy.parameters(),
             self.tasks,
             self.n_envs,
@@ -259,32 +259,33 @@ class ReptilePPO(SequencePPO):
             seed=self.seed,
             rng=self.rng,
         )
-        self.inner_loop(Theta.of(self), task, rng, learning)  # lines 5-7 and 13-15
+        self._inner_updates(task, rng, learning)  # theta becomes theta_hat: lines 5-7 and 13-15
         self.meta_iteration += 1
         self.logger.record("reptile/meta_iteration", self.meta_iteration)
         if self.meta_update:
             beta = FloatSchedule(self.meta_learning_rate)(self._current_progress_remaining)
-            norm = self.outer_optimizer.step(self.policy.parameters(), initial, beta)  # lines 8 and 16
+            norm = self.outer_optimizer.step(self.policy.parameters(), theta, beta)  # lines 8 and 16
             self.logger.record("reptile/meta_learning_rate", beta)
             self.logger.record("reptile/meta_step_norm", norm)
 
-    def inner_loop(
-        self, theta: Theta, task: Task, rng: np.random.Generator, learning: _Learning | None = None
-    ) -> Theta:
+    def inner_loop(self, theta: Theta, task: Task, rng: np.random.Generator) -> Theta:
         """Make the inner updates of one task: ``theta`` becomes ``theta_hat`` (lines 5-7).
 
         The result follows from the arguments and the hyperparameters alone, so that another process can compute it.
+        :meth:`learn` makes the same updates from the theta that the model holds.
 
         :param theta: where to start
         :param task: what to train on
         :param rng: source of randomness in rollouts and updates
-        :param learning: the call of :meth:`learn` that this is a part of; without one nobody is called back
         :return: theta_hat, which the model holds then, too
         """
-        if learning is None:
-            _, callback = self._setup_learn(theta.total_timesteps)
-            learning = _Learning(callback)
+        _, callback = self._setup_learn(theta.total_timesteps)
         theta.put_into(self)
+        self._inner_updates(task, rng, _Learning(callback))
+        return Theta.of(self)
+
+    def _inner_updates(self, task: Task, rng: np.random.Generator, learning: _Learning) -> None:
+        """Make ``inner_updates`` times a rollout and an update on a task, from the parameters that the model holds."""
         self.rng = rng
         if self.reward_scaler is not None:
             self.reward_scaler.reset_returns()
@@ -305,7 +306,6 @@ class ReptilePPO(SequencePPO):
             self.train(derivation=self.searching and odd)  # line 7
             if self.num_timesteps >= self._total_timesteps:
                 break
-        return Theta.of(self)
 
     def _goes_on(self, learning: _Learning) -> bool:
         return self.num_timesteps < self._total_timesteps and not learning.stopped
