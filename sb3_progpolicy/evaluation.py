@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -55,7 +55,7 @@ class Evaluation:
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields as JSON values."""
-        return dataclasses.asdict(self)
+        return cast(dict[str, Any], _as_json(dataclasses.asdict(self)))
 
 
 def evaluate_program(
@@ -258,3 +258,12 @@ def spec_of(env_id: str) -> Any:
         return gym.spec(env_id)
     except (gym.error.Error, ModuleNotFoundError):
         raise unknown("environment", env_id, gym.registry) from None
+
+
+def _as_json(value: Any) -> Any:
+    """Return NumPy's numbers and arrays as Python's, in mappings and sequences too."""
+    if isinstance(value, Mapping):
+        return {str(key): _as_json(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_as_json(item) for item in value]
+    return value.tolist() if isinstance(value, (np.generic, np.ndarray)) else value

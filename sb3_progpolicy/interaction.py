@@ -116,10 +116,7 @@ def program_names(venv: VecEnv) -> tuple[tuple[str, ...], tuple[str, ...]]:
     spec = action_spec(venv.action_space)
     history = spec.interaction_size if is_vecenv_wrapped(venv, VecInteractionHistory) else 0
     n_observations = int(np.prod(venv.observation_space.shape or (0,))) - history
-    observations, actions = (
-        tuple(venv.get_attr(attribute)[0]) if venv.has_attr(attribute) else ()
-        for attribute in ("observation_names", "action_names")
-    )
+    observations, actions = (_names(venv, attribute) for attribute in ("observation_names", "action_names"))
     if len(observations) != n_observations:
         observations = tuple(f"observation[{i}]" for i in range(n_observations))
     if len(actions) != spec.n_outputs:
@@ -128,3 +125,9 @@ def program_names(venv: VecEnv) -> tuple[tuple[str, ...], tuple[str, ...]]:
         remembered = (*(f"previous {name}" for name in actions), "previous reward", "previous done")
         return (*observations, *remembered), actions
     return observations, actions
+
+
+def _names(venv: VecEnv, attribute: str) -> tuple[str, ...]:
+    """Return the names that an environment gives, in a list or an array; none where it has none."""
+    names = venv.get_attr(attribute)[0] if venv.has_attr(attribute) else None
+    return () if names is None else tuple(map(str, names))

@@ -16,7 +16,7 @@ from stable_baselines3.common.distributions import (
     MultiCategoricalDistribution,
 )
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import MlpExtractor
+from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
@@ -58,7 +58,7 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
     :param cell: ``"gru"``, ``"lstm"``, ``"rnn"`` or ``"affine"``
     :param condition_size: hidden units per condition
     :param temperature: of the sigmoid in the soft semantics, above 0
-    :param net_arch: hidden layers of the critic
+    :param net_arch: hidden layers of the critic, a list or ``dict(vf=[...])``
     :param activation_fn: of the critic
     :param log_std_init: initial logarithm of the standard deviation of Box actions
     :param optimizer_class: of the inner updates
@@ -78,7 +78,7 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
         cell: Cell = "gru",
         condition_size: int = 1,
         temperature: float = 1.0,
-        net_arch: list[int] | None = None,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
         activation_fn: type[nn.Module] = nn.ReLU,
         log_std_init: float = 0.0,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
@@ -89,6 +89,16 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
         check_observation_space(observation_space)
         if temperature <= 0:
             raise ValueError(f"temperature={temperature} is not accepted; it is above 0")
+        extractor = kwargs.get("features_extractor_class", FlattenExtractor)
+        if extractor not in (FlattenExtractor, NormalizingExtractor):
+            raise ValueError(
+                f"features_extractor_class={extractor.__name__} is not accepted; a program reads what it is printed to "
+                "read. FlattenExtractor is accepted, and NormalizingExtractor, which is folded into the program"
+            )
+        if isinstance(net_arch, dict):
+            if net_arch.get("pi"):
+                raise ValueError(f"net_arch={net_arch} is not accepted; the actor is a program, 'vf' is the critic's")
+            net_arch = net_arch.get("vf", [])
         if kwargs.pop("use_sde", False):
             raise ValueError("use_sde=True is not accepted; a program's Box actions have a state-independent noise")
         self.program_kwargs: dict[str, Any] = {

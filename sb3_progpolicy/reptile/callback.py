@@ -9,6 +9,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
+from sb3_progpolicy.finite import check_parameters, check_step
 from sb3_progpolicy.reptile.statistics import EpisodeStatistics
 from sb3_progpolicy.reptile.steps import MetaOptimizer, MetaOptimizerName, Task, begin_task
 from sb3_progpolicy.reptile.tasks import TaskDistribution
@@ -93,6 +94,8 @@ class ReptileWrapper(BaseCallback):
         self._updates_of_task += 1
 
     def _on_step(self) -> bool:
+        check_step("the reward", self.locals["rewards"], self.num_timesteps)
+        check_step("the observation", self.locals["new_obs"], self.num_timesteps)
         self._statistics.add(self._task.indices, self.locals["dones"], self.locals["infos"])
         return True
 
@@ -120,6 +123,7 @@ class ReptileWrapper(BaseCallback):
 
     def _meta_step(self) -> None:
         """Line 8: step the initial parameters, on which the next task starts."""
+        check_parameters(self.model.policy.named_parameters(), self.num_timesteps)
         self._updates_of_task = 0
         self.meta_iteration += 1
         self.logger.record("reptile/meta_iteration", self.meta_iteration)
@@ -149,8 +153,7 @@ def start_task(model: OnPolicyAlgorithm, tasks: TaskDistribution, task: Task) ->
     assert env is not None
     if task.seed is not None:
         model.set_random_seed(task.seed)
-    tasks.put_in_force(env, task.variations)
-    model._last_obs = env.reset()  # type: ignore[assignment]
+    model._last_obs = tasks.reset(env, task.variations)
     model._last_episode_starts = np.ones((env.num_envs,), dtype=bool)
     states = getattr(model, "_last_lstm_states", None)
     if states is not None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from typing import Any, Literal
 
@@ -19,6 +20,7 @@ Variation = dict[str, Any]
 Draw = Callable[[np.random.Generator], Any]
 Apply = Literal["options", "attributes", "constructor"]
 APPLY: tuple[Apply, ...] = ("options", "attributes", "constructor")
+MAX_LABEL = 30  # characters that SB3's table of logs shows
 
 
 class Sampler(ABC):
@@ -173,17 +175,29 @@ class TaskDistribution:
         self.success_rates[index] = success if smoothing == 1 else old + smoothing * (success - old)
 
     def label(self, index: int) -> str:
-        """Return a short name of a variation for logs, such as ``n_discs=3``; what all of them share is left out."""
-        variation = self.variations[index]
+        """Return a short and unique name of a variation for logs, such as ``n_discs=3``.
+
+        What all variations share is left out, and numbers are rounded. Where that makes a name too long for SB3's
+        logger, or the name of two variations, it begins with the index.
+        """
+        return self._labels[index]
+
+    @cached_property
+    def _labels(self) -> list[str]:
+        first = self.variations[0]
         shared = {
             name
-            for name, value in variation.items()
-            if all(name in other and other[name] == value for other in self.variations)
+            for name in first
+            if len(self) > 1 and all(name in other and _same(other[name], first[name]) for other in self.variations)
         }
-        if len(self) == 1:
-            shared = set()
-        parts = (f"{k}={'drawn' if callable(v) else v}" for k, v in variation.items() if k not in shared)
-        return ",".join(parts) or "default"
+        labels = [
+            ",".join(f"{name}={_short(value)}" for name, value in variation.items() if name not in shared) or "default"
+            for variation in self.variations
+        ]
+        return [
+            label if len(label) <= MAX_LABEL and labels.count(label) == 1 else f"{index}:{label}"[:MAX_LABEL]
+            for index, label in enumerate(labels)
+        ]
 
     def put_in_force(self, env: VecEnv, variations: Sequence[Variation]) -> None:
         """Make the variations those that the next reset of ``env`` starts with.
@@ -193,7 +207,7 @@ class TaskDistribution:
         :raises ValueError: if the environments cannot be varied in this way
         """
         if self.apply == "options":
-            env.set_options([dict(variation) for variation in variations])
+            env.set_options([_Options(variation) for variation in variations])
             return
         for row, variation in enumerate(variations):
             if self.apply == "constructor":
@@ -202,6 +216,74 @@ class TaskDistribution:
             for name, value in variation.items():
                 if not _call(env, row, "set_wrapper_attr", name, value, force=False):
                     raise ValueError(f"{name!r} is not accepted; the environment has no attribute of this name")
+
+    def reset(self, env: VecEnv, variations: Sequence[Variation]) -> Any:
+        """Put variations in force and reset the environments.
+
+        :param env: the training environments
+        :param variations: one for each environment
+        :return: the first observations
+        :raises ValueError: if the environments cannot be varied in this way, or take no notice of a reset option
+        """
+        self.put_in_force(env, variations)
+        given: Any = env.unwrapped._options
+        observations = env.reset()
+        if self.apply == "options":
+            self._check_noticed(env, given)
+        return observations
+
+    def _check_noticed(self, env: VecEnv, options: Sequence[Any]) -> None:
+        """Raise an error if no environment has looked at an option, so that training would go on unchanged."""
+        if not all(isinstance(given, _Options) and not given.sent for given in options):
+            return  # copied or sent to another process, where nobody can look
+        unread = set(self.variations[0]).difference(*(given.read for given in options))
+        if unread:
+            names = ", ".join(sorted(unread))
+            raise ValueError(
+                f"the reset option {names} has no effect; {_name_of(env)} does not read it. Other ways to set a "
+                "variation are apply='attributes', for what the environment keeps in attributes, and "
+                "apply='constructor', with each environment wrapped in RemakeOnVariation"
+            )
+
+
+class _Options(dict[str, Any]):
+    """Reset options that know which of them have been read."""
+
+    def __init__(self, variation: Variation) -> None:
+        super().__init__(variation)
+        self.read: set[str] = set()
+        self.sent = False
+
+    def __getitem__(self, name: str) -> Any:
+        self.read.add(name)
+        return super().__getitem__(name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        self.read.add(name)
+        return super().get(name, default)
+
+    def pop(self, name: str, *default: Any) -> Any:
+        self.read.add(name)
+        return super().pop(name, *default)
+
+    def keys(self) -> Any:
+        self.read.update(super().keys())
+        return super().keys()
+
+    def items(self) -> Any:
+        self.read.update(super().keys())
+        return super().items()
+
+    def __iter__(self) -> Iterator[str]:
+        self.read.update(super().keys())
+        return super().__iter__()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> _Options:  # SB3 copies options
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:  # for another process
+        self.sent = True
+        return dict, (dict(super().items()),)
 
 
 def default_tasks(env_id: str | None) -> TaskDistribution:
@@ -242,6 +324,21 @@ def _call(env: VecEnv, row: int, method: str, *args: Any, **kwargs: Any) -> Any:
             "apply='options' works with all"
         )
     return env.env_method(method, *args, indices=[row], **kwargs)[0]
+
+
+def _name_of(env: VecEnv) -> str:
+    spec = env.get_attr("spec")[0] if env.has_attr("spec") else None
+    return "the environment" if spec is None else spec.id
+
+
+def _same(one: Any, other: Any) -> bool:
+    return type(one) is type(other) and bool(np.all(np.asarray(one == other)))
+
+
+def _short(value: Any) -> str:
+    if callable(value):
+        return "drawn"
+    return f"{value:.4g}" if isinstance(value, (float, np.floating)) else str(value)
 
 
 def _enumerate(variations: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> list[Variation]:

@@ -11,9 +11,7 @@ from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import FlattenExtractor
 
-from sb3_progpolicy.normalization import NormalizingExtractor
 from sb3_progpolicy.policies import ProgrammaticActorCritic
 from sb3_progpolicy.reptile_ppo.rollout import Actor, Batch, PolicyActor, SamplerActor, SequenceBuffer, states_of
 
@@ -116,8 +114,7 @@ class _ProgramAdapter(Adapter):
         self, states: RNNStates | None, buffer: SequenceBuffer, n_steps: int, rng: np.random.Generator
     ) -> Actor:
         """See :class:`Adapter`."""
-        known = type(self.policy.features_extractor) in (FlattenExtractor, NormalizingExtractor)
-        if not known or self.policy.device.type != "cpu":
+        if self.policy.device.type != "cpu":
             return super().make_actor(states, buffer, n_steps, rng)
         return SamplerActor(self.policy, states, buffer.n_envs, n_steps, rng)
 

@@ -69,7 +69,7 @@ class ReptilePPO(SequencePPO):
     :param n_steps: steps of a rollout, per environment
     :param batch_size: transitions per gradient step; recurrent policies take ``batch_size / n_steps`` whole sequences,
         or, where ``batch_size`` is smaller, sequences of ``batch_size`` steps, which must then divide ``n_steps``. By
-        default an eighth of the rollout
+        default an eighth of the rollout, or the next smaller divisor of ``n_steps``
     :param n_epochs: passes over a rollout
     :param gamma: discount factor
     :param gae_lambda: of generalised advantage estimation
@@ -130,8 +130,8 @@ class ReptilePPO(SequencePPO):
         ent_coef: float = 0.01,
         vf_coef: float = 0.5,
         max_grad_norm: float = 0.5,
-        target_kl: float | None = None,
         *,
+        target_kl: float | None = None,
         tasks: TaskDistribution | Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
         n_envs: int | None = None,
         env_kwargs: Mapping[str, Any] | None = None,
@@ -164,7 +164,7 @@ class ReptilePPO(SequencePPO):
         if env is not None:
             venv = with_history(make_venv(env, n_envs, seed, env_kwargs or {}), interaction_history)
         if batch_size is None:
-            batch_size = max(2, n_steps * (1 if venv is None else venv.num_envs) // 8)
+            batch_size = _default_batch_size(n_steps, 1 if venv is None else venv.num_envs)
         policy_class = self._get_policy_from_name(policy) if isinstance(policy, str) else policy
         if learning_rate is None:
             learning_rate = 1e-2 if issubclass(policy_class, ProgrammaticActorCritic) else 3e-4
@@ -382,3 +382,9 @@ class ReptilePPO(SequencePPO):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer", "outer_optimizer"], []
+
+
+def _default_batch_size(n_steps: int, n_envs: int) -> int:
+    """Return an eighth of a rollout; where that is less than a sequence, the next smaller divisor of its length."""
+    size = max(2, n_steps * n_envs // 8)
+    return size if size >= n_steps else max(part for part in range(1, size + 1) if n_steps % part == 0)

@@ -102,7 +102,7 @@ class Actor(Protocol):
 
 
 class PolicyActor:
-    """Asks the policy itself: for networks, on a GPU, and for feature extractors of the user's own.
+    """Asks the policy itself: for networks, and on a GPU.
 
     :param policy: any actor-critic policy
     :param states: the recurrent states at the start, ``None`` for a policy without

@@ -23,11 +23,13 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_progpolicy.finite import check_parameters, check_step, check_update
 from sb3_progpolicy.normalization import NormalizingExtractor, RewardScaler
 from sb3_progpolicy.policies import DERIVATION_LR_SCALE
 from sb3_progpolicy.reptile_ppo import update
 from sb3_progpolicy.reptile_ppo.adapters import adapt
 from sb3_progpolicy.reptile_ppo.rollout import Actor, Batch, SequenceBuffer, minibatches
+from sb3_progpolicy.spaces import action_spec
 
 
 class SequencePPO(PPO):
@@ -125,6 +127,8 @@ class SequencePPO(PPO):
             actions = actor.act(self._last_obs, step)  # type: ignore[arg-type]
             new_obs, rewards, dones, infos = env.step(self._to_env(actions))
             self.num_timesteps += env.num_envs
+            check_step("the reward", rewards, self.num_timesteps)
+            check_step("the observation", new_obs, self.num_timesteps)
             callback.update_locals(locals())
             if not callback.on_step():
                 return False
@@ -174,7 +178,11 @@ class SequencePPO(PPO):
         self, rewards: NDArray[Any], dones: NDArray[np.bool_], infos: list[dict[str, Any]]
     ) -> None:
         """Add the value of the state at which an episode was cut short, as PPO does."""
-        rows = [row for row in dones.nonzero()[0].tolist() if infos[row].get("TimeLimit.truncated", False)]
+        rows = [
+            row
+            for row in dones.nonzero()[0].tolist()
+            if infos[row].get("TimeLimit.truncated", False) and infos[row].get("terminal_observation") is not None
+        ]
         if rows:
             last = np.stack([infos[row]["terminal_observation"] for row in rows])
             with th.no_grad():
@@ -207,16 +215,19 @@ class SequencePPO(PPO):
             statistics.append(measured)
             if self.target_kl is not None and measured["approx_kl"] > 1.5 * self.target_kl:
                 break
+            check_update(loss, self.num_timesteps)
             self.policy.optimizer.zero_grad()
             loss.backward()
             th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
             self.policy.optimizer.step()
+        check_parameters(self.policy.named_parameters(), self.num_timesteps)
         self._freeze(derivation=False, phi=False)
         self._n_updates += self.n_epochs
         self._log(statistics, clip_range)
-        if isinstance(self.policy.features_extractor, NormalizingExtractor):
-            observations = self.rollout_buffer.observations
-            self.policy.features_extractor.update(observations.reshape(-1, observations.shape[-1]))
+        observations = self.rollout_buffer.observations
+        for extractor in self.policy.modules():
+            if isinstance(extractor, NormalizingExtractor):
+                extractor.update(observations.reshape(-1, observations.shape[-1]))
 
     @property
     def searching(self) -> bool:
@@ -283,10 +294,28 @@ class SequencePPO(PPO):
         :param episode_start: changes nothing: states survive the end of an episode, as in training (section 2.4)
         :param deterministic: take the likeliest action, or the mean, instead of drawing one
         """
+        self._check_observation(observation)
         actions, state = super().predict(observation, state, None, deterministic)
         if isinstance(self.action_space, spaces.Discrete):
-            actions = actions + self.action_space.start
+            actions = np.asarray(actions + self.action_space.start)
         return actions, state
+
+    def _check_observation(self, observation: Any) -> None:
+        if isinstance(observation, tuple):
+            raise ValueError(
+                "a tuple is not an observation; Gymnasium's reset() returns (observation, info): pass the first of it. "
+                "model.get_env() gives an environment whose reset() returns observations alone"
+            )
+        expected = self.observation_space.shape
+        if len(expected or ()) != 1 or np.ndim(observation) not in (1, 2) or np.shape(observation)[-1:] == expected:
+            return
+        history = action_spec(self.action_space).interaction_size
+        if np.shape(observation)[-1] + history == expected[0]:  # type: ignore[index]
+            raise ValueError(
+                f"the observation has {np.shape(observation)[-1]} numbers; the policy reads {expected[0]}, "  # type: ignore[index]
+                f"of which {history} are the previous action, reward and done flag. Take observations from "
+                "model.get_env(), or from the environment wrapped in sb3_progpolicy.InteractionHistory"
+            )
 
     def save(
         self,
