@@ -101,7 +101,8 @@ class HanoiEnv(PlanningEnv):
     Terminated when all discs lie on the target peg; truncated after 500 steps (``max_episode_steps``).
 
     ## Information
-    ``info["is_success"]`` at every step; at reset also ``info["variation"]`` and ``info["optimal_steps"]``.
+    ``info["is_success"]`` at every step; at reset also ``info["variation"]`` and ``info["optimal_steps"]``, the
+    length of a shortest solution, whose actions ``env.unwrapped.plan()`` returns.
 
     ## Arguments
     ``gym.make("Hanoi-v0", n_discs=5)`` or ``env.reset(options={"n_discs": 5})``; an option stays in force until it
@@ -176,6 +177,10 @@ class HanoiEnv(PlanningEnv):
         reward += GOAL_REWARD * solved
         self._show()
         return self._observe(), reward, solved, False, {"is_success": solved}
+
+    def plan(self) -> list[int]:
+        """Return the actions of the one shortest solution from the present state."""
+        return [MOVES.index(move) for move in planner.plan(self.discs, self.target)]
 
     def _tops(self) -> list[int]:
         """Index of the top disc of each peg, 0 the smallest; ``n_discs`` for an empty peg."""
