@@ -83,7 +83,7 @@ DOMAINS: dict[str, Domain] = {
         *(
             Domain(
                 id=f"Panda{task}-v0",
-                entry_point=f"progpolicy_envs.panda:Panda{task}Env",
+                entry_point=f"progpolicy_envs.panda:make_{task.lower()}",
                 vector_entry_point=f"progpolicy_envs.panda.vector:Panda{task}VectorEnv",
                 size=size,
                 train=tuple({size: number} for number in (1, 2, 3)),

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import typer
 
-from sb3_progpolicy.cli import evaluating, playing, rendering, showing, training
+from sb3_progpolicy.cli import envs, evaluating, play, render, showing, training
 from sb3_progpolicy.cli.parsing import repeat_flags
 from sb3_progpolicy.nearest import unknown
 
@@ -22,9 +22,9 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "train": training.train,
     "evaluate": evaluating.evaluate,
     "show": showing.show,
-    "render": rendering.render,
-    "play": playing.play,
-    "envs": showing.envs,
+    "render": render.render,
+    "play": play.play,
+    "envs": envs.envs,
 }
 for _name, _command in COMMANDS.items():
     app.command(_name)(_command)

@@ -13,9 +13,8 @@ from pathlib import Path
 import gymnasium as gym
 
 from progpolicy_envs import get_domain
-from progpolicy_envs.planners.panda import CONTROLLERS
 from sb3_progpolicy.programs.files import write_atomically
-from tests.handwritten.evaluate import play, play_batch, play_controller, size_of
+from tests.handwritten.evaluate import play, play_batch, play_plan, size_of
 from tests.handwritten.hanoi import hanoi_program
 from tests.handwritten.hiking import egocentric_program, map_program
 from tests.handwritten.panda import PROGRAMS
@@ -56,7 +55,7 @@ def panda(n_seeds: int, sizes: list[int]) -> list[str]:
             variation = {domain.size: size}
             part = "train" if variation in domain.train else "unseen"
             ours = [play(program, env, seed, **variation) for seed in range(n_seeds)]
-            scripted = [play_controller(CONTROLLERS[env_id], env, seed, **variation) for seed in range(n_seeds)]
+            scripted = [play_plan(env, seed, **variation) for seed in range(n_seeds)]
             both = [(a.steps, b.steps) for a, b in zip(ours, scripted, strict=True) if a.success and b.success]
             comparison = "- | - | - | -"
             if both:

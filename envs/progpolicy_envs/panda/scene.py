@@ -286,9 +286,9 @@ class Scene:
         self._activate(body, pybullet.ACTIVATION_STATE_SLEEP)
 
     def step(self) -> None:
-        """Simulate one control step and take over what comes of it."""
+        """Simulate one control step and read the state after it."""
         self.simulate()
-        self.take_over()
+        self.sync_state()
 
     def simulate(self) -> None:
         """Compute the physics of one control step."""
@@ -304,12 +304,12 @@ class Scene:
             if other_margin:
                 set_engine(contactBreakingThreshold=BULLET_MARGIN, physicsClientId=client)
 
-    def take_over(self) -> None:
-        """Read the state after the physics and let things that lie still fall asleep."""
+    def sync_state(self) -> None:
+        """Read the state after the physics, and deactivate the objects that lie still."""
         before = self.positions
         self.read()
         if self.physics.sleeping and before:
-            self._lull(before)
+            self._deactivate(before)
 
     def _is_delicate(self) -> bool:
         gripper, lifted = self.robot.position, self._lifted
@@ -340,7 +340,7 @@ class Scene:
         self.robot.set_time_step(seconds / in_one_call, in_one_call)
         pybullet.setPhysicsEngineParameter(fixedTimeStep=seconds, numSubSteps=in_one_call, physicsClientId=self.client)
 
-    def _lull(self, before: Sequence[Point]) -> None:
+    def _deactivate(self, before: Sequence[Point]) -> None:
         """Put the objects to sleep that have not moved for a while; whatever touches one wakes it.
 
         :param before: the objects' centres one control step ago

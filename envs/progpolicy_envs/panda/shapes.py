@@ -9,8 +9,9 @@ from typing import Any
 import pybullet
 
 _SEGMENTS = 32
-#: A compound of one shape is made the shape itself unless that is off the centre, metres.
-_HAIR = 1e-9
+#: How far a compound's only shape is off the centre, metres; PyBullet would replace a compound of one centred shape by
+#: that shape.
+_EPSILON = 1e-9
 #: By how much a drum's foot stands out of it, metres.
 _FOOT = 0.001
 #: Half the side of a drum's square foot to its radius; the corners stay just inside.
@@ -30,7 +31,7 @@ def bearing_box(half_extents: Sequence[float], client: int) -> int:
     shape: int = pybullet.createCollisionShapeArray(
         shapeTypes=[pybullet.GEOM_BOX],
         halfExtents=[list(half_extents)],
-        collisionFramePositions=[[0.0, 0.0, _HAIR]],
+        collisionFramePositions=[[0.0, 0.0, _EPSILON]],
         physicsClientId=client,
     )
     return shape
