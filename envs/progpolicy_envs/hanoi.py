@@ -75,8 +75,8 @@ class HanoiEnv(PlanningEnv):
     | 1   | 0 -> 2 | 3   | 1 -> 2 | 5   | 2 -> 1 |
 
     ## Observation Space
-    ``Box(9,)``, three numbers for each peg, the same for any number of discs. Only what lies on top of a peg counts
-    for the rules, so only that is shown.
+    ``Box(9,)``, three numbers for each peg, the same for any number of discs. The rules depend on the top discs alone,
+    so only these are shown.
 
     | Num     | Observation | Min | Max | Meaning                                                                  |
     |---------|-------------|-----|-----|--------------------------------------------------------------------------|
@@ -94,8 +94,8 @@ class HanoiEnv(PlanningEnv):
     -0.01 a step, a further -0.05 for an illegal move, +1 when the last disc reaches the target.
 
     ## Starting State
-    All discs on the source peg. Source and target are fixed, or drawn anew for each episode where they are
-    ``"random"``, which shows a policy the same puzzle from all sides.
+    All discs on the source peg. Source and target are fixed or, where they are ``"random"``, drawn for each episode,
+    which shows a policy the same puzzle from all sides.
 
     ## Episode End
     Terminated when all discs lie on the target peg; truncated after 500 steps (``max_episode_steps``).

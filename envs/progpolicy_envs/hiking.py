@@ -34,7 +34,7 @@ class _WholeMap(MapView):
 
 
 class _FramedMap(MapView):
-    """The map of which HikingEgo-v0 shows a window; framed, so that there is a window around every cell."""
+    """The map of which HikingEgo-v0 shows a window, with a frame so that there is a window around every cell."""
 
     star_value: ClassVar[float] = 1.0
     hiker_value: ClassVar[float] = 0.0
@@ -147,7 +147,7 @@ class HikingEnv(_WholeMap, PathwayEnv):
 
 @with_sections(_SECTIONS, id="HikingEgo-v0")
 class HikingEgoEnv(_FramedMap, PathwayEnv):
-    """Walk the pathways of a map, of which the cells around the hiker are seen, and collect every star.
+    """Walk the pathways of a map, seen as the cells around the hiker, and collect every star.
 
     $task
 
@@ -163,12 +163,12 @@ class HikingEgoEnv(_FramedMap, PathwayEnv):
     | pathway with a star                  | 1      |
 
     ### What a short program can do with it
-    Whoever walks tree-like pathways with the right hand on the edge comes to every cell. The rule is one affine
-    controller: the score of direction d is K times the cell in direction d, plus a preference for the right-hand turn
-    over straight on, over left, over back, which is a weight on the previous action. With preferences 3, 2, 1, 0 and
-    K above 3 a blocked cell is never chosen. A star next to the hiker adds K to its direction and is taken first; that
-    moves the hiker to another place of the same round trip, at most once for each star. Nothing in it depends on the
-    map or on the number of stars.
+    Walking tree-like pathways with the right hand on the edge leads to every cell. The rule is one affine controller:
+    the score of direction d is K times the cell in direction d, plus a weight on the previous action that prefers the
+    right-hand turn over straight on, over left, over back. With the weights 3, 2, 1, 0 and K above 3 a blocked cell is
+    never chosen. A star next to the hiker adds K to its direction and is taken first; that moves the hiker to another
+    place of the same round trip, at most once for each star. Nothing in it depends on the map or on the number of
+    stars.
 
     $rules
 

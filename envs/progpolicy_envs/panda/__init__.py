@@ -35,7 +35,7 @@ __all__ = [
 
 
 class _ObjectsEnv(PandaEnv):
-    """What the environments have in common in which objects lie on the table."""
+    """What the three environments with objects have in common."""
 
     variations: ClassVar[VariationSpace] = VariationSpace(
         IntParameter("n_objects", 1, MAX_OBJECTS, "number of objects")
@@ -117,12 +117,12 @@ class PandaPushEnv(_ObjectsEnv):
     $spaces
 
     ### What a short program can do with it
-    An interval or an "and" takes more than one affine test, but each branch sees only what those before it leave
-    over, and ``reach`` and ``distance`` are lengths already, so that a test that adds one to a height bounds a cone.
-    Five branches: in a funnel above the block, go down with open fingers; high above the table, fly over the block;
-    low and not around it, rise; around it with open fingers, close them; otherwise draw it along the line.
-    Positions relative to the gripper make every command a weighted sum, and nothing in them is of a place on the
-    table or of a number of blocks. Which of these is to be done is not in the observation.
+    One affine test is neither an interval nor an "and". But each branch is reached only where the tests before it
+    fail, and ``reach`` and ``distance`` are lengths already, so that one affine test of a length and a height bounds
+    a cone. Five branches are enough: in a funnel above the block, go down with open fingers; high above the table,
+    fly over the block; low and not around it, rise; around it with open fingers, close them; otherwise draw it along
+    the line. Positions relative to the gripper make every command a weighted sum, in which neither a place on the
+    table nor the number of blocks occurs. Which of these is to be done is not in the observation.
 
     ## Rewards
     ``reward_type="dense"`` (default), the sum of
@@ -165,13 +165,12 @@ class PandaSlideEnv(_ObjectsEnv):
     A delivered puck keeps the position at which it was delivered.
 
     ### What a short program can do with it
-    Seven branches, in this order: at the end of the arm's reach, draw back; not behind the puck, fly there; low
-    behind a puck at rest, take it gently into the middle between the fingers; low behind a puck that moves, push;
+    Seven branches are enough, in this order: at the end of the arm's reach, draw back; not behind the puck, fly there;
+    low behind a puck at rest, take it gently into the middle between the fingers; low behind a puck that moves, push;
     puck under way, draw back; behind it and high, go down; otherwise fly there. "Behind", "low" and "near" are sums of
-    ``object_d``, ``gripper`` and ``reach``. A push has a direction and a speed: the one is ``line``, across which the
-    puck's offset from the gripper is corrected, and the other is made relative to the puck's own,
-    ``0.3 + 0.75 * object_v``, so that the fingers are always a little faster than the puck and do not lose it. Which
-    speed or which way is right is not in the observation.
+    ``object_d``, ``gripper`` and ``reach``. A push goes in the direction of ``line`` and corrects the puck's offset
+    across it; its speed, ``0.3 + 0.75 * object_v``, keeps the fingers a little faster than the puck, so that they do
+    not lose it. Which speed or which way is right is not in the observation.
 
     ## Rewards
     ``reward_type="dense"`` (default), the sum of
@@ -212,13 +211,13 @@ class PandaStackEnv(_ObjectsEnv):
     $spaces
 
     ### What a short program can do with it
-    The tower is the difficulty: what is right for a block depends on its height above its place, which grows from
-    block to block. ``object`` minus ``target`` is that height at any level, and ``distance`` is a length, so one affine
-    test of both is a cone that stands on the place. A block above a flat cone is being carried and comes down on it;
-    a block at the tip, inside a steep one, has been set down; a block on the table is in neither, for towers of any
-    height. Seven branches in this order: carry; let go and rise; in a funnel above the block, go down; above the
-    tower, fly over the block; not around it, rise; fingers open, close them; otherwise lift. Since ``target`` rises
-    with the tower, flying 6 cm above it clears the tower. Which of these is to be done is not in the observation.
+    The difficulty is the tower: what to do with a block depends on its height above its place in the tower. That height
+    is ``object`` minus ``target`` for every block, and ``distance`` is a length, so one affine test of both is a cone
+    whose tip is the place. A block above a flat cone is being carried and comes down on it; a block inside a steep
+    cone, at the tip, has been set down; a block on the table is in neither, however high the tower. Seven branches are
+    enough, in this order: carry; let go and rise; in a funnel above the block, go down; above the tower, fly over the
+    block; not around it, rise; fingers open, close them; otherwise lift. Since ``target`` rises with the tower, flying
+    6 cm above it clears the tower. Which of these is to be done is not in the observation.
 
     ## Rewards
     ``reward_type="dense"`` (default), the sum of

@@ -20,7 +20,7 @@ _PARTS = (len(FEATURE_NAMES), len(FEATURE_NAMES) + len(ACHIEVED_NAMES))
 class PandaGoalEnv(PandaEnv, GoalEnv):
     """A Panda environment whose observation is a dictionary, with rewards for goals other than the one pursued.
 
-    A class of its own because SB3 takes whatever has a ``compute_reward`` for a goal environment.
+    It is a class of its own because SB3 takes everything that has a ``compute_reward`` for a goal environment.
     """
 
     def __init__(self, *args: Any, **arguments: Any) -> None:

@@ -48,8 +48,8 @@ _DISC = Mark("drum", (0.05, 0.05, 0.001), pale=True)
 class Task(ABC):
     """One task and its state in the running episode.
 
-    A few numbers are read at every step, so they are plain floats rather than arrays: ``positions``, of what is to be
-    brought to the targets, ``targets`` and ``finished`` have one entry per object.
+    ``positions`` (of what has to come to the targets), ``targets`` and ``finished`` have one entry per object. They are
+    read at every step, so they are lists of plain floats, which are faster than small arrays.
     """
 
     table: ClassVar[Table] = Table()
@@ -96,7 +96,7 @@ class Task(ABC):
         return False
 
     def settled(self, scene: Scene, index: int) -> bool:
-        """Return whether an object, if it is at its target, is finished as far as all else is concerned."""
+        """Return whether an object would be finished if it were at its target: whether all other conditions hold."""
         return True
 
     @abstractmethod
@@ -193,7 +193,7 @@ class Push(Task):
             if not (apart(start, before, self.separation) and apart(target, done, self.separation)):
                 return False
             behind = extended(start, target, self.run_up)
-            # While this block is pushed the earlier ones lie on their targets, and the other way round.
+            # While this block is pushed the earlier ones lie on their targets; while they are, it lies at its start.
             return reachable(behind) and all(
                 corridor_distance(behind, target, there) > self.clearance
                 and corridor_distance(extended(here, there, self.run_up), there, start) > self.clearance
@@ -254,14 +254,14 @@ class Slide(Task):
 
         while True:
             starts = sample_in_order(n_objects, propose, fits)[0]
-            # The front pucks come first, so that they do not bar the way of those behind them.
+            # The front pucks come first, so that they are not in the way of those behind them.
             starts = starts[np.argsort(-starts[:, 0])]
             targets = self._sample_targets(rng, starts.tolist())
             if len(targets) == n_objects:
                 return _on_table(starts, np.array(targets), height=self.kind.height)
 
     def _sample_targets(self, rng: np.random.Generator, starts: Sequence[Place]) -> list[Place]:
-        """Return targets for the first pucks, x and y; fewer than there are pucks where one finds no place."""
+        """Return targets, x and y, in the order of the pucks, up to the first puck for which there is no place."""
         targets: list[Place] = []
         for index, start in enumerate(starts):
             candidates: list[Place] = rng.uniform((0.3, -0.29), (0.54, 0.29), (128, 2)).tolist()

@@ -1,7 +1,7 @@
 """The batched form of the Panda environments: several simulations in one process, each part of a step for all of them.
 
-A step of one environment evicts much of Python from the processor's caches while it computes the physics, and the
-other way round. So first all arms get their commands, then the physics of all are computed, then all are read.
+Physics and Python evict each other from the processor's caches. So a step first gives all arms their commands, then
+computes the physics of all simulations, then reads all of them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from progpolicy_envs.vector import DomainVectorEnv, Infos, check_num_envs
 class PandaVectorEnv(DomainVectorEnv):
     """N simulations stepped together, equal to N single environments step for step.
 
-    A subclass names the single form. ``infos`` of a step hold what a single one's info does, in arrays.
+    A subclass names what makes a single one. ``infos`` of a step hold the items of a single one's info, in arrays.
 
     :param num_envs: number of environments
     :param max_episode_steps: steps after which an episode is truncated; ``None`` for no limit
