@@ -17,7 +17,6 @@ from tests.envs.helpers import (
     assert_checkers_are_silent,
     assert_long_run_stays_sound,
     assert_picture_shows_the_state,
-    assert_resets_hold_no_memory,
     assert_window_opens_shows_and_closes,
 )
 from tests.handwritten.evaluate import Player, play, play_batch, size_of
@@ -293,10 +292,6 @@ def test_text_shows_hiker_stars_rocks_and_water() -> None:
 
 def test_picture_shows_the_state() -> None:
     assert_picture_shows_the_state(gym.make("Hiking-v0", render_mode="rgb_array"), action=EAST)
-
-
-def test_a_thousand_resets_hold_no_memory() -> None:
-    assert_resets_hold_no_memory("HikingEgo-v0", n_stars=6, layout="lakeside")
 
 
 def test_window_opens_shows_and_closes() -> None:

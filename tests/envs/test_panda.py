@@ -149,6 +149,7 @@ def test_goal_form_holds_the_flat_numbers_and_computes_the_step_reward(env_id):
             achieved.append(parts["achieved_goal"])
             desired.append(parts["desired_goal"])
             assert goal.unwrapped.compute_terminated(achieved[-1], desired[-1], info) == terminated
+        assert infos
         computed = goal.unwrapped.compute_reward(np.array(achieved), np.array(desired), infos)
         assert computed == pytest.approx(np.array(rewards), abs=1e-4)
     with pytest.raises(ValueError, match="copy_info_dict=True"):
