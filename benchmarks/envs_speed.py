@@ -13,21 +13,15 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-import progpolicy_envs  # noqa: F401 (registers the ids)
+from progpolicy_envs import DOMAINS
 
 #: Takes steps for about so many seconds and returns the steps per second.
 Runner = Callable[[float], float]
-CASES: dict[str, tuple[str, dict[str, Any]]] = {
-    "Hanoi-v0": ("Hanoi-v0", {}),
-    "Hiking-v0, map": ("Hiking-v0", {"observation": "map"}),
-    "Hiking-v0, egocentric": ("Hiking-v0", {"observation": "egocentric"}),
-    "Stacking-v0": ("Stacking-v0", {}),
-}
+IDS = [domain.id for domain in DOMAINS.values() if not domain.simulation]
 
 
 def clocked(step: Callable[[int], object], steps_per_call: int) -> Runner:
@@ -43,17 +37,17 @@ def clocked(step: Callable[[int], object], steps_per_call: int) -> Runner:
     return run
 
 
-def batched_runner(env_id: str, num_envs: int, **arguments: Any) -> Runner:
+def batched_runner(env_id: str, num_envs: int) -> Runner:
     """Return a runner of the batched form."""
-    env = gym.make_vec(env_id, num_envs=num_envs, vectorization_mode="vector_entry_point", **arguments)
+    env = gym.make_vec(env_id, num_envs=num_envs, vectorization_mode="vector_entry_point")
     env.reset(seed=0)
     actions = np.random.default_rng(0).integers(env.single_action_space.n, size=(997, num_envs))  # type: ignore[attr-defined]
     return clocked(lambda call: env.step(actions[call % len(actions)]), num_envs)
 
 
-def single_runner(env_id: str, **arguments: Any) -> Runner:
+def single_runner(env_id: str) -> Runner:
     """Return a runner of the single form, made as a user makes it."""
-    env = gym.make(env_id, **arguments)
+    env = gym.make(env_id)
     env.reset(seed=0)
     actions = np.random.default_rng(0).integers(env.action_space.n, size=997)  # type: ignore[attr-defined]
 
@@ -98,9 +92,9 @@ def main() -> None:
     options = parser.parse_args()
 
     runners: dict[tuple[str, str], Runner] = {}
-    for name, (env_id, arguments) in CASES.items():
-        runners[name, "batched"] = batched_runner(env_id, options.num_envs, **arguments)
-        runners[name, "single"] = single_runner(env_id, **arguments)
+    for env_id in IDS:
+        runners[env_id, "batched"] = batched_runner(env_id, options.num_envs)
+        runners[env_id, "single"] = single_runner(env_id)
     peer = pddlgym_runner()
     if peer is not None:
         runners["Hanoi-v0", "PDDLGym"] = peer
@@ -112,10 +106,10 @@ def main() -> None:
 
     print(f"steps/s, median of {options.rounds} interleaved rounds of {options.seconds:g} s, N = {options.num_envs}\n")
     print(f"{'domain':<24}{'batched':>12}{'single':>12}{'ratio':>8}{'PDDLGym':>12}{'ratio':>8}")
-    for name in CASES:
-        batched, single, other = speed[name, "batched"], speed[name, "single"], speed.get((name, "PDDLGym"))
+    for env_id in IDS:
+        batched, single, other = speed[env_id, "batched"], speed[env_id, "single"], speed.get((env_id, "PDDLGym"))
         compared = f"{other:>12,.0f}{batched / other:>8,.0f}" if other else f"{'-':>12}{'-':>8}"
-        print(f"{name:<24}{batched:>12,.0f}{single:>12,.0f}{batched / single:>8,.0f}{compared}")
+        print(f"{env_id:<24}{batched:>12,.0f}{single:>12,.0f}{batched / single:>8,.0f}{compared}")
     if peer is None:
         print("\nPDDLGym is not installed; its column is empty.")
 

@@ -22,20 +22,19 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 
-import progpolicy_envs
+from progpolicy_envs import DOMAINS
 from progpolicy_envs.panda import PANDA_GYM_PHYSICS, Physics
-from progpolicy_envs.planners.panda import CONTROLLERS
 
 PHYSICS = {"ours": Physics(), "panda-gym": PANDA_GYM_PHYSICS}
+IDS = [domain.id for domain in DOMAINS.values() if domain.simulation]
 LIBRARIES = ("numpy", "pybullet", "gymnasium")
 
 
 def solve(env: gym.Env, env_id: str, seed: int, size: int) -> int | None:
     """Return the number of steps in which the controller solves a variation, or ``None``."""
-    domain = progpolicy_envs.get_domain(env_id)
-    observation, _ = env.reset(seed=seed, options={domain.size: size})
-    for step in range(1, 501):
-        observation, _, terminated, truncated, info = env.step(CONTROLLERS[env_id](observation))
+    env.reset(seed=seed, options={DOMAINS[env_id].size: size})
+    for step, action in enumerate(env.unwrapped.plan(), start=1):  # type: ignore[attr-defined]
+        _, _, terminated, truncated, info = env.step(action)
         if terminated or truncated:
             return step if info["is_success"] else None
     return None
@@ -64,7 +63,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=100, help="episodes for each task and number of objects")
     parser.add_argument("--sizes", type=int, nargs="+", default=[1, 3, 5, 8], help="numbers of objects")
-    parser.add_argument("--tasks", nargs="+", choices=list(CONTROLLERS), default=list(CONTROLLERS))
+    parser.add_argument("--tasks", nargs="+", choices=IDS, default=IDS)
     parser.add_argument("--physics", choices=[*PHYSICS, "both"], default="both")
     parser.add_argument("--output", type=Path, help="Markdown file for the table")
     arguments = parser.parse_args()

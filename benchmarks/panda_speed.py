@@ -27,10 +27,12 @@ from typing import Any
 import gymnasium as gym
 import pybullet
 
-from progpolicy_envs import DOMAINS
+from progpolicy_envs import DOMAINS, Domain
 
 STEPS, BATCH = 50, 8
-TASKS = ("PandaReach", "PandaPush", "PandaSlide", "PandaStack")
+TASKS = [domain for domain in DOMAINS.values() if domain.simulation]
+#: Blocks that panda-gym's tasks have; those not named have one object.
+PEER_BLOCKS = {"PandaStack-v3": 2}
 MISSING = (
     "panda-gym is not installed, so its columns are empty; it is in the extra `peers`: "
     'pip install "sb3-progpolicy[peers]", or panda-gym alone'
@@ -59,10 +61,9 @@ def block_runner(env: AnyEnv) -> Block:
     return run
 
 
-def ours(task: str, size: int) -> gym.Env[Any, Any]:
+def ours(task: Domain, size: int) -> gym.Env[Any, Any]:
     """Return one of our environments without Gymnasium's checks."""
-    domain = DOMAINS[f"{task}-v0"]
-    return made(domain.id, **{domain.size: size})
+    return made(task.id, **{task.size: size})
 
 
 def made(env_id: str, **arguments: Any) -> gym.Env[Any, Any]:
@@ -72,9 +73,9 @@ def made(env_id: str, **arguments: Any) -> gym.Env[Any, Any]:
         return gym.make(env_id, disable_env_checker=True, **arguments)
 
 
-def batch(task: str) -> gym.vector.VectorEnv[Any, Any, Any]:
+def batch(task: Domain) -> gym.vector.VectorEnv[Any, Any, Any]:
     """Return several of our environments with one object each in their batched form."""
-    return gym.make_vec(f"{task}-v0", num_envs=BATCH, vectorization_mode="vector_entry_point")
+    return gym.make_vec(task.id, num_envs=BATCH, vectorization_mode="vector_entry_point")
 
 
 def physics_runner(env: AnyEnv) -> Block:
@@ -155,19 +156,21 @@ def ratio(numerators: Sequence[tuple[float, float]], denominators: Sequence[tupl
     return median(one[1] / other[1] for one, other in zip(numerators, denominators, strict=True))
 
 
-def table_row(task: str, blocks: int, rounds: int) -> str:
+def table_row(task: Domain, blocks: int, rounds: int) -> str:
     """Measure a task and return its row."""
-    one, other = ours(task, 1), made(f"{task}-v3") if panda_gym_is_installed() else None
+    name, _, _ = task.id.rpartition("-v")
+    peer = f"{name}-v3"
+    one, other = ours(task, 1), made(peer) if panda_gym_is_installed() else None
     runners = {"one": block_runner(one), "physics": physics_runner(one), "eight": block_runner(ours(task, 8))}
     several = batch(task)
     runners |= {"batch": block_runner(several), "physics of batch": physics_runner(several)}
     if other is not None:
-        runners["equal"] = block_runner(ours(task, 2)) if task == "PandaStack" else runners["one"]
+        runners["equal"] = block_runner(ours(task, PEER_BLOCKS[peer])) if peer in PEER_BLOCKS else runners["one"]
         runners["peer"] = block_runner(other)
     measured = measure(runners, blocks, rounds)
     rate = {name: 1 / median(step for _, step in values) for name, values in measured.items()}
     resets = [1000 * median(reset for reset, _ in measured[name]) for name in ("one", "eight")]
-    row = f"{task:<12}{rate['one']:>8,.0f}{rate['eight']:>8,.0f}{ratio(measured['eight'], measured['one']):>8.2f}"
+    row = f"{name:<12}{rate['one']:>8,.0f}{rate['eight']:>8,.0f}{ratio(measured['eight'], measured['one']):>8.2f}"
     row += f"{rate['physics']:>10,.0f}{ratio(measured['physics'], measured['one']):>8.0%}"
     row += f"{BATCH * rate['batch']:>8,.0f}{ratio(measured['physics of batch'], measured['batch']):>8.0%}"
     if other is None:

@@ -1,4 +1,7 @@
-"""The domains: ids, training variations and unseen test variations, read by the plugin, the benchmark and the docs."""
+"""The domains: what makes their environments, which variations to train on, and which to test on.
+
+Registration, the plugin, the benchmark and the docs read them from here; no other file lists ids.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +19,18 @@ class Domain:
     """One task domain.
 
     :param id: environment id
+    :param entry_point: what makes one environment, as ``module:name``
+    :param vector_entry_point: what makes a batch of them, as ``module:name``
     :param size: name of the parameter that makes tasks harder, such as ``n_discs``
     :param train: the variations to train on, the easiest first
     :param unseen: the variations to test generalisation on
-    :param arguments: constructor arguments that hold for all of them
+    :param arguments: constructor arguments with which the id is registered
     :param simulation: whether its steps are physics, so costly that several processes are worth having
     """
 
     id: str
+    entry_point: str
+    vector_entry_point: str
     size: str
     train: tuple[Variation, ...]
     unseen: tuple[Variation, ...]
@@ -36,53 +43,62 @@ DOMAINS: dict[str, Domain] = {
     for domain in (
         Domain(
             id="Hanoi-v0",
+            entry_point="progpolicy_envs.hanoi:HanoiEnv",
+            vector_entry_point="progpolicy_envs.hanoi:HanoiVectorEnv",
             size="n_discs",
             train=tuple({"n_discs": n_discs, "source": "random", "target": "random"} for n_discs in (1, 2, 3, 4)),
             unseen=tuple({"n_discs": n_discs} for n_discs in (5, 6, 7, 8)),
         ),
         Domain(
             id="Hiking-v0",
+            entry_point="progpolicy_envs.hiking:HikingEnv",
+            vector_entry_point="progpolicy_envs.hiking:HikingVectorEnv",
             size="n_stars",
             train=tuple({"n_stars": n_stars} for n_stars in (1, 2, 3, 4)),
             unseen=tuple({"n_stars": n_stars} for n_stars in (5, 6, 7, 8, 9, 10)),
         ),
+        # From the hiker's point of view: what is learned on some maps is tested on others.
+        Domain(
+            id="HikingEgo-v0",
+            entry_point="progpolicy_envs.hiking:HikingEgoEnv",
+            vector_entry_point="progpolicy_envs.hiking:HikingEgoVectorEnv",
+            size="n_stars",
+            train=tuple(
+                {"n_stars": n_stars, "layout": layout}
+                for n_stars, layout in product((1, 2, 3, 4), ("valley", "comb", "fork"))
+            ),
+            unseen=tuple(
+                {"n_stars": n_stars, "layout": layout}
+                for n_stars, layout in product((5, 6, 7, 8, 9, 10), ("spiral", "lakeside", "random"))
+            ),
+        ),
         Domain(
             id="Stacking-v0",
+            entry_point="progpolicy_envs.stacking:StackingEnv",
+            vector_entry_point="progpolicy_envs.stacking:StackingVectorEnv",
             size="n_plates",
             train=tuple({"n_plates": n_plates} for n_plates in (1, 2, 3, 4)),
             unseen=tuple({"n_plates": n_plates} for n_plates in (5, 6, 7, 8)),
         ),
         *(
             Domain(
-                id=env_id,
+                id=f"Panda{task}-v0",
+                entry_point=f"progpolicy_envs.panda:make_{task.lower()}",
+                vector_entry_point=f"progpolicy_envs.panda.vector:Panda{task}VectorEnv",
                 size=size,
                 train=tuple({size: number} for number in (1, 2, 3)),
                 unseen=tuple({size: number} for number in (4, 5, 6, 7, 8)),
                 simulation=True,
             )
-            for env_id, size in (
-                ("PandaReach-v0", "n_targets"),
-                ("PandaPush-v0", "n_objects"),
-                ("PandaSlide-v0", "n_objects"),
-                ("PandaStack-v0", "n_objects"),
+            for task, size in (
+                ("Reach", "n_targets"),
+                ("Push", "n_objects"),
+                ("Slide", "n_objects"),
+                ("Stack", "n_objects"),
             )
         ),
     )
 }
-
-#: Hiking once more, from the hiker's point of view: what is learned on some maps is tested on others.
-HIKING_EGOCENTRIC = Domain(
-    id="Hiking-v0",
-    size="n_stars",
-    train=tuple(
-        {"n_stars": n_stars, "layout": layout} for n_stars, layout in product((1, 2, 3, 4), ("valley", "comb", "fork"))
-    ),
-    unseen=tuple(
-        {"n_stars": n_stars, "layout": layout}
-        for n_stars, layout in product((5, 6, 7, 8, 9, 10), ("spiral", "lakeside", "random"))
-    ),
-    arguments={"observation": "egocentric"},
-)
 
 
 def get_domain(env_id: str) -> Domain:

@@ -75,8 +75,8 @@ class HanoiEnv(PlanningEnv):
     | 1   | 0 -> 2 | 3   | 1 -> 2 | 5   | 2 -> 1 |
 
     ## Observation Space
-    ``Box(9,)``, three numbers for each peg, the same for any number of discs. Only what lies on top of a peg counts
-    for the rules, so only that is shown.
+    ``Box(9,)``, three numbers for each peg, the same for any number of discs. The rules depend on the top discs alone,
+    so only these are shown.
 
     | Num     | Observation | Min | Max | Meaning                                                                  |
     |---------|-------------|-----|-----|--------------------------------------------------------------------------|
@@ -94,14 +94,15 @@ class HanoiEnv(PlanningEnv):
     -0.01 a step, a further -0.05 for an illegal move, +1 when the last disc reaches the target.
 
     ## Starting State
-    All discs on the source peg. Source and target are fixed, or drawn anew for each episode where they are
-    ``"random"``, which shows a policy the same puzzle from all sides.
+    All discs on the source peg. Source and target are fixed or, where they are ``"random"``, drawn for each episode,
+    which shows a policy the same puzzle from all sides.
 
     ## Episode End
     Terminated when all discs lie on the target peg; truncated after 500 steps (``max_episode_steps``).
 
     ## Information
-    ``info["is_success"]`` at every step; at reset also ``info["variation"]`` and ``info["optimal_steps"]``.
+    ``info["is_success"]`` at every step; at reset also ``info["variation"]`` and ``info["optimal_steps"]``, the
+    length of a shortest solution, whose actions ``env.unwrapped.plan()`` returns.
 
     ## Arguments
     ``gym.make("Hanoi-v0", n_discs=5)`` or ``env.reset(options={"n_discs": 5})``; an option stays in force until it
@@ -176,6 +177,10 @@ class HanoiEnv(PlanningEnv):
         reward += GOAL_REWARD * solved
         self._show()
         return self._observe(), reward, solved, False, {"is_success": solved}
+
+    def plan(self) -> list[int]:
+        """Return the actions of the one shortest solution from the present state."""
+        return [MOVES.index(move) for move in planner.plan(self.discs, self.target)]
 
     def _tops(self) -> list[int]:
         """Index of the top disc of each peg, 0 the smallest; ``n_discs`` for an empty peg."""

@@ -53,6 +53,14 @@ class PlanningEnv(gym.Env[NDArray[np.float32], np.int64], ABC):
             self._display.show(self._frame())
 
     @abstractmethod
+    def plan(self) -> list[int]:
+        """Return the actions of a shortest solution from the present state.
+
+        ``for action in env.unwrapped.plan(): env.step(action)`` solves the task, as in every environment of this
+        package.
+        """
+
+    @abstractmethod
     def _frame(self) -> Frame:
         """Draw the state, ``(height, width, 3)`` bytes."""
 

@@ -91,7 +91,8 @@ class StackingEnv(PlanningEnv):
     Terminated when all plates are on the stack; truncated after 500 steps (``max_episode_steps``).
 
     ## Information
-    ``info["is_success"]`` at every step; at reset also ``info["variation"]`` and ``info["optimal_steps"]``.
+    ``info["is_success"]`` at every step; at reset also ``info["variation"]`` and ``info["optimal_steps"]``, the
+    length of a shortest solution, whose actions ``env.unwrapped.plan()`` returns.
 
     ## Arguments
     ``gym.make("Stacking-v0", n_plates=5)`` or ``env.reset(options={"n_plates": 5})``; an option stays in force until
@@ -169,6 +170,10 @@ class StackingEnv(PlanningEnv):
         solved = not self.plates
         self._show()
         return self._observe(), reward, solved, False, {"is_success": solved}
+
+    def plan(self) -> list[int]:
+        """Return the actions of a shortest solution from the present state."""
+        return planner.plan(self.gripper, self.plates)
 
     def _observe(self) -> NDArray[np.float32]:
         n_plates = self.variation["n_plates"]

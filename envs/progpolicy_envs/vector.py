@@ -1,4 +1,4 @@
-"""What batched environments have in common: variations and seeds by row, and a reset within the step that ends one."""
+"""What the batched environments share: variations and seeds by row, and the reset in the step that ends an episode."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import typer
 
-from sb3_progpolicy.cli import evaluate, playing, rendering, show, train
+from sb3_progpolicy.cli import envs, evaluate, play, render, show, train
 from sb3_progpolicy.cli.parsing import repeat_flags
 from sb3_progpolicy.nearest import unknown
 
@@ -22,9 +22,9 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "train": train.train,
     "evaluate": evaluate.evaluate,
     "show": show.show,
-    "render": rendering.render,
-    "play": playing.play,
-    "envs": show.envs,
+    "render": render.render,
+    "play": play.play,
+    "envs": envs.envs,
 }
 for _name, _command in COMMANDS.items():
     app.command(_name)(_command)

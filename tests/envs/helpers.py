@@ -54,17 +54,6 @@ def assert_long_run_stays_sound(env_id: str, n_actions: int, options: list[dict[
     assert resident_bytes() - after_warm_up < 8 * 2**20
 
 
-def assert_resets_hold_no_memory(env_id: str, **arguments: Any) -> None:
-    """Reset the single form a thousand times, with an action in between."""
-    env = gym.make(env_id, **arguments)
-    for reset in range(1200):
-        if reset == 200:
-            after_warm_up = resident_bytes()
-        env.reset(seed=reset)
-        env.step(env.action_space.sample())
-    assert resident_bytes() - after_warm_up < 4 * 2**20
-
-
 def assert_picture_shows_the_state(env: gym.Env[Any, Any], action: int) -> None:
     """Check the form of a picture, that it changes with the state, and that reading it does not change the state."""
     env.reset(seed=0)

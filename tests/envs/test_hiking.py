@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from progpolicy_envs.hiking import ACTION_NAMES, STAR, HikingEnv
+from progpolicy_envs.hiking import HikingEgoEnv, HikingEnv
 from progpolicy_envs.layouts import LAYOUTS, N_RANDOM_LAYOUTS, NEIGHBOURS, Layout, random_layout
 from progpolicy_envs.planners import hiking as planner
 from sb3_progpolicy.programs.syntax import Program
@@ -17,13 +17,13 @@ from tests.envs.helpers import (
     assert_checkers_are_silent,
     assert_long_run_stays_sound,
     assert_picture_shows_the_state,
-    assert_resets_hold_no_memory,
     assert_window_opens_shows_and_closes,
 )
 from tests.handwritten.evaluate import Player, play, play_batch, size_of
 from tests.handwritten.hiking import egocentric_program, map_program, turns
 
 NORTH, EAST, SOUTH, WEST = range(4)
+ENVS = {"Hiking-v0": HikingEnv, "HikingEgo-v0": HikingEgoEnv}
 SAMPLE = [*LAYOUTS.values(), *(random_layout(number) for number in range(0, N_RANDOM_LAYOUTS, 16))]
 
 
@@ -133,7 +133,7 @@ def test_plan_of_no_stars_is_empty() -> None:
 def test_environment_takes_the_plan_and_ends_at_its_last_step_only(n_stars: int, layout: str) -> None:
     env = HikingEnv(n_stars=n_stars, layout=layout)
     _, info = env.reset(seed=n_stars)
-    actions = planner.plan(env.layout, env.hiker, sorted(env.stars))
+    actions = env.plan()
     assert len(actions) == info["optimal_steps"]
     results = [env.step(action) for action in actions]
     assert [result[2] for result in results] == [False] * (len(actions) - 1) + [True]
@@ -145,14 +145,14 @@ def test_environment_takes_the_plan_and_ends_at_its_last_step_only(n_stars: int,
 @given(
     n_stars=st.integers(1, 12),
     layout=st.sampled_from([*LAYOUTS, "random"]),
-    observation=st.sampled_from(["map", "egocentric"]),
+    env_id=st.sampled_from(list(ENVS)),
     seed=st.integers(0, 2**31),
     actions=st.lists(st.integers(0, 3), max_size=60),
 )
 def test_any_actions_obey_the_map_and_keep_the_observation_inside_its_space(
-    n_stars: int, layout: str, observation: str, seed: int, actions: list[int]
+    n_stars: int, layout: str, env_id: str, seed: int, actions: list[int]
 ) -> None:
-    env = HikingEnv(n_stars=n_stars, layout=layout, observation=observation)  # type: ignore[arg-type]
+    env = ENVS[env_id](n_stars=n_stars, layout=layout)
     seen, _ = env.reset(seed=seed)
     rows, place, stars = env.layout.rows, divmod(env.hiker, 10), {divmod(star, 10) for star in env.stars}
     assert len(stars) == n_stars
@@ -169,29 +169,29 @@ def test_any_actions_obey_the_map_and_keep_the_observation_inside_its_space(
         assert terminated == (not stars)
         if terminated:
             break
-        assert_observation_shows(dict(zip(env.observation_names, seen, strict=True)), observation, rows, place, stars)
+        assert_observation_shows(dict(zip(env.observation_names, seen, strict=True)), env_id, rows, place, stars)
 
 
 def assert_observation_shows(
-    named: dict[str, float], observation: str, rows: tuple[str, ...], hiker: tuple[int, int], stars: set
+    named: dict[str, float], env_id: str, rows: tuple[str, ...], hiker: tuple[int, int], stars: set
 ) -> None:
     """Rebuild every number of an observation from the text of the map."""
     for row, column in product(range(-4, 13), range(-4, 15)):
         inside = 0 <= row < 8 and 0 <= column < 10
         value = 0.0 if inside and rows[row][column] in ".H" else -1.0
         if (row, column) in stars:
-            value = 1 / 16 if observation == "map" else 1.0
+            value = 1 / 16 if env_id == "Hiking-v0" else 1.0
         if (row, column) == hiker:
             value = 1.0
         down, right = row - hiker[0], column - hiker[1]
-        if observation == "map" and inside:
+        if env_id == "Hiking-v0" and inside:
             assert named[f"map[{row},{column}]"] == value
-        elif observation == "egocentric" and max(abs(down), abs(right)) <= 4 and (down or right):
+        elif env_id == "HikingEgo-v0" and max(abs(down), abs(right)) <= 4 and (down or right):
             assert named[f"window[{down:+d},{right:+d}]"] == value
 
 
 def test_directions_are_clockwise_and_north_is_up() -> None:
-    assert ACTION_NAMES == ("north", "east", "south", "west")
+    assert HikingEnv.action_names == HikingEgoEnv.action_names == ("north", "east", "south", "west")
     assert NEIGHBOURS[11].tolist() == [1, 12, 21, 10]
     assert NEIGHBOURS[0].tolist() == [0, 1, 10, 0]
     assert NEIGHBOURS[79].tolist() == [69, 79, 79, 78]
@@ -202,7 +202,7 @@ def test_directions_are_clockwise_and_north_is_up() -> None:
 def test_handwritten_egocentric_program_collects_all_stars_on_every_map(layout: str, n_stars: int) -> None:
     program = egocentric_program()
     assert size_of(program) == (0, 1)
-    episodes = play_batch(program, "Hiking-v0", 100, observation="egocentric", layout=layout, n_stars=n_stars)
+    episodes = play_batch(program, "HikingEgo-v0", 100, layout=layout, n_stars=n_stars)
     assert all(episode.success for episode in episodes)
     assert all(episode.steps >= episode.optimal for episode in episodes)
     # Without a map of the stars a round trip is the best one can do; it costs little when there are many.
@@ -214,21 +214,21 @@ def test_handwritten_egocentric_program_collects_all_stars_on_every_map(layout: 
 def test_handwritten_map_program_solves_training_and_unseen_variations(n_stars: int) -> None:
     program = map_program("valley")
     assert size_of(program) == (3, 4)
-    episodes = play_batch(program, "Hiking-v0", 100, observation="map", layout="valley", n_stars=n_stars)
+    episodes = play_batch(program, "Hiking-v0", 100, layout="valley", n_stars=n_stars)
     assert all(episode.success for episode in episodes)
     round_trip = 2 * int(LAYOUTS["valley"].is_path.sum() - 1)
     assert all(episode.optimal <= episode.steps <= round_trip for episode in episodes)
 
 
 @pytest.mark.parametrize(
-    ("observation", "layout", "program"),
-    [("egocentric", "random", egocentric_program()), ("map", "valley", map_program("valley"))],
+    ("env_id", "layout", "program"),
+    [("HikingEgo-v0", "random", egocentric_program()), ("Hiking-v0", "valley", map_program("valley"))],
 )
 def test_handwritten_programs_go_on_when_their_history_survives_episodes(
-    observation: str, layout: str, program: Program
+    env_id: str, layout: str, program: Program
 ) -> None:
     policy = Player(program)
-    env = gym.make("Hiking-v0", observation=observation, layout=layout)
+    env = gym.make(env_id, layout=layout)
     assert all(play(policy, env, seed=seed, n_stars=1 + seed % 10).success for seed in range(30))
 
 
@@ -236,7 +236,7 @@ def test_handwritten_programs_go_on_when_their_history_survives_episodes(
 def test_stars_never_outweigh_the_hiker_in_the_map_program(layout: str) -> None:
     for heading in range(4):
         agreeing = max(Counter(turns(LAYOUTS[layout], heading).values()).values(), default=0)
-        assert 2.0 * STAR["map"] * agreeing < 1.0
+        assert 2.0 * HikingEnv.star_value * agreeing < 1.0
 
 
 def test_positions_follow_the_seed_and_change_from_episode_to_episode() -> None:
@@ -257,21 +257,18 @@ def test_random_layout_is_followed_by_the_named_one_when_asked() -> None:
 
 
 @pytest.mark.parametrize("make", [gym.make, lambda *a, **k: gym.make_vec(*a, num_envs=2, **k)])
-def test_unknown_observation_is_refused(make: object) -> None:
-    with pytest.raises(ValueError, match=r"observation='window' is not accepted; .* 'map', 'egocentric'"):
-        make("Hiking-v0", observation="window")  # type: ignore[operator]
+@pytest.mark.parametrize("observation", ["map", "egocentric"])
+def test_choice_of_observation_that_was_once_an_argument_names_the_id_that_replaces_it(
+    make: object, observation: str
+) -> None:
+    with pytest.raises(ValueError, match=f"observation='{observation}' is not accepted; .* HikingEgo-v0"):
+        make("Hiking-v0", observation=observation)  # type: ignore[operator]
 
 
-def test_observation_is_not_a_variation() -> None:
-    with pytest.raises(ValueError, match="unknown variation parameter 'observation'"):
-        HikingEnv().reset(options={"observation": "egocentric"})
-
-
-def test_spaces_are_those_of_every_observation() -> None:
-    for observation in ("map", "egocentric"):
-        env = HikingEnv(observation=observation)  # type: ignore[arg-type]
-        assert env.observation_space == gym.spaces.Box(-1.0, 1.0, (80,), dtype=np.float32)
-        assert len(set(env.observation_names)) == 80
+@pytest.mark.parametrize("env_class", ENVS.values())
+def test_every_cell_that_is_seen_has_a_name_of_its_own(env_class: type[HikingEnv]) -> None:
+    assert env_class().observation_space == gym.spaces.Box(-1.0, 1.0, (80,), dtype=np.float32)
+    assert len(set(env_class.observation_names)) == 80
 
 
 @pytest.mark.parametrize("action", [-1, 4, 0.5])
@@ -297,21 +294,17 @@ def test_picture_shows_the_state() -> None:
     assert_picture_shows_the_state(gym.make("Hiking-v0", render_mode="rgb_array"), action=EAST)
 
 
-def test_a_thousand_resets_hold_no_memory() -> None:
-    assert_resets_hold_no_memory("Hiking-v0", n_stars=6, layout="lakeside", observation="egocentric")
-
-
 def test_window_opens_shows_and_closes() -> None:
     assert_window_opens_shows_and_closes("Hiking-v0")
 
 
 @pytest.mark.parametrize(("n_stars", "layout"), [(1, "valley"), (12, "random"), (12, "spiral")])
-@pytest.mark.parametrize("observation", ["map", "egocentric"])
-def test_environment_checkers_find_nothing(n_stars: int, layout: str, observation: str) -> None:
-    assert_checkers_are_silent("Hiking-v0", n_stars=n_stars, layout=layout, observation=observation)
+@pytest.mark.parametrize("env_id", ENVS)
+def test_environment_checkers_find_nothing(n_stars: int, layout: str, env_id: str) -> None:
+    assert_checkers_are_silent(env_id, n_stars=n_stars, layout=layout)
 
 
-@pytest.mark.parametrize("observation", ["map", "egocentric"])
-def test_long_run_of_random_actions(observation: str) -> None:
+@pytest.mark.parametrize("env_id", ENVS)
+def test_long_run_of_random_actions(env_id: str) -> None:
     options = [{"n_stars": n, "layout": layout} for n, layout in ((1, "fork"), (3, "comb"), (5, "random"))]
-    assert_long_run_stays_sound("Hiking-v0", 1_000_000, options, observation=observation)
+    assert_long_run_stays_sound(env_id, 1_000_000, options)

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
+import inspect
+import pickle
 import warnings
+from itertools import islice, repeat
 
 import gymnasium as gym
 import numpy as np
 import pybullet
 import pytest
+from gymnasium.envs.registration import load_env_creator
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from gymnasium_robotics.core import GoalEnv
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-import progpolicy_envs
+from progpolicy_envs import DOMAINS
+from progpolicy_envs.panda import PandaPushEnv, PandaPushGoalEnv, make_push
 from progpolicy_envs.panda.tasks import Slide
-from progpolicy_envs.planners.panda import CONTROLLERS
 
-IDS = ("PandaReach-v0", "PandaPush-v0", "PandaSlide-v0", "PandaStack-v0")
-OBJECT_IDS = IDS[1:]
+IDS = [domain.id for domain in DOMAINS.values() if domain.simulation]
+OBJECT_IDS = [env_id for env_id in IDS if DOMAINS[env_id].size == "n_objects"]
 
 
 def size_of(env_id: str) -> str:
-    return progpolicy_envs.get_domain(env_id).size
+    return DOMAINS[env_id].size
 
 
 def make(env_id: str, size: int = 1, **kwargs):
@@ -90,13 +94,7 @@ def test_variation_is_set_by_constructor_or_options_and_stays_in_force(env_id):
 @pytest.mark.parametrize("keyword", ["observation", "reward_type", "render_mode"])
 def test_unknown_options_are_refused_by_name(keyword):
     with pytest.raises(ValueError, match=f"{keyword}='nonsense'"):
-        progpolicy_envs_panda().PandaPushEnv(**{keyword: "nonsense"})
-
-
-def progpolicy_envs_panda():
-    import progpolicy_envs.panda
-
-    return progpolicy_envs.panda
+        make_push(**{keyword: "nonsense"})
 
 
 def test_bad_actions_are_refused_and_large_ones_clipped():
@@ -110,16 +108,36 @@ def test_bad_actions_are_refused_and_large_ones_clipped():
     assert np.array_equal(env.step(np.ones(4, np.float32))[0], clipped)
 
 
+def test_each_form_is_a_class_of_its_own_and_only_the_goal_form_computes_rewards():
+    for observation, env_class in (("flat", PandaPushEnv), ("goal", PandaPushGoalEnv)):
+        env = make("PandaPush-v0", observation=observation).unwrapped
+        assert type(env) is pickle.loads(pickle.dumps(env_class)) is env_class
+        assert isinstance(env, PandaPushEnv)
+        assert isinstance(env, GoalEnv) == hasattr(env, "compute_reward") == (observation == "goal")
+        env.close()
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_docstring_is_complete_and_about_its_own_task(env_id):
+    text = inspect.getdoc(load_env_creator(gym.spec(env_id).entry_point))
+    assert "$" not in text
+    assert f'gym.make("{env_id}", {size_of(env_id)}=5)' in text
+    headings = [line.removeprefix("## ") for line in text.splitlines() if line.startswith("## ")]
+    assert headings[:4] == ["Description", "Action Space", "Observation Space", "Rewards"]
+    assert headings[4:] == [
+        *("Starting State", "Episode End", "Information", "Arguments", "References", "Version History")
+    ]
+
+
 @pytest.mark.parametrize("env_id", IDS)
 def test_goal_form_holds_the_flat_numbers_and_computes_the_step_reward(env_id):
     for reward_type in ("dense", "sparse"):
         flat = make(env_id, 3, reward_type=reward_type)
         goal = make(env_id, 3, observation="goal", reward_type=reward_type)
-        numbers, _ = flat.reset(seed=4)
-        parts, _ = goal.reset(seed=4)
+        flat.reset(seed=4)
+        goal.reset(seed=4)
         infos, rewards, achieved, desired = [], [], [], []
-        for _ in range(60):
-            action = CONTROLLERS[env_id](numbers)
+        for action in islice(goal.unwrapped.plan(), 60):
             numbers, reward, *_ = flat.step(action)
             parts, goal_reward, terminated, _, info = goal.step(action)
             assert np.array_equal(
@@ -131,8 +149,7 @@ def test_goal_form_holds_the_flat_numbers_and_computes_the_step_reward(env_id):
             achieved.append(parts["achieved_goal"])
             desired.append(parts["desired_goal"])
             assert goal.unwrapped.compute_terminated(achieved[-1], desired[-1], info) == terminated
-            if terminated:
-                break
+        assert infos
         computed = goal.unwrapped.compute_reward(np.array(achieved), np.array(desired), infos)
         assert computed == pytest.approx(np.array(rewards), abs=1e-4)
     with pytest.raises(ValueError, match="copy_info_dict=True"):
@@ -216,37 +233,30 @@ def test_gripper_wakes_a_sleeping_block_and_pushes_it():
     for _ in range(100):
         observation = env.step(np.zeros(4, np.float32))[0]
     assert observation[26:29] == pytest.approx(begin, abs=1e-3)
-    for _ in range(60):
-        observation, _, terminated, _, info = env.step(CONTROLLERS["PandaPush-v0"](observation))
-        if terminated:
-            break
+    *_, (*_, info) = (env.step(action) for action in islice(env.unwrapped.plan(), 60))
     assert info["is_success"]
 
 
 @pytest.mark.parametrize(("env_id", "size"), [(env_id, size) for env_id in IDS for size in (1, 3)])
-def test_controller_solves_small_variations(env_id, size):
+def test_plan_solves_small_variations_and_ends_with_the_episode(env_id, size):
     env = gym.make(env_id, disable_env_checker=True)
     for seed in range(100, 103):
-        observation, _ = env.reset(seed=seed, options={size_of(env_id): size})
-        terminated = truncated = False
-        while not (terminated or truncated):
-            observation, _, terminated, truncated, info = env.step(CONTROLLERS[env_id](observation))
+        env.reset(seed=seed, options={size_of(env_id): size})
+        for action in env.unwrapped.plan():
+            _, _, terminated, truncated, info = env.step(action)
+            assert not truncated
+        assert terminated
         assert info["is_success"], (env_id, size, seed)
 
 
 @pytest.mark.parametrize("env_id", IDS)
 def test_dense_return_of_the_controller_beats_standing_still(env_id):
     returns = []
-    for control in (CONTROLLERS[env_id], lambda _: np.zeros(4, np.float32)):
+    for planned in (True, False):
         env = make(env_id)
-        observation, _ = env.reset(seed=1)
-        total = 0.0
-        for _ in range(100):
-            observation, reward, terminated, _, _ = env.step(control(observation))
-            total += reward
-            if terminated:
-                break
-        returns.append(total)
+        env.reset(seed=1)
+        actions = env.unwrapped.plan() if planned else repeat(np.zeros(4, np.float32))
+        returns.append(sum(env.step(action)[1] for action in islice(actions, 100)))
     assert returns[0] > returns[1] + 1
 
 

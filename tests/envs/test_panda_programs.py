@@ -6,8 +6,7 @@ import gymnasium as gym
 import pytest
 
 from progpolicy_envs import get_domain
-from progpolicy_envs.planners.panda import CONTROLLERS
-from tests.handwritten.evaluate import play, play_controller, size_of
+from tests.handwritten.evaluate import play, play_plan, size_of
 from tests.handwritten.panda import PROGRAMS
 
 
@@ -18,7 +17,7 @@ def test_handwritten_program_solves_about_as_fast_as_the_scripted_controller(env
     env = gym.make(env_id, disable_env_checker=True)
     ours = [play(program, env, seed, **variation) for seed in range(3)]
     assert [episode.success for episode in ours] == [True] * 3
-    scripted = [play_controller(CONTROLLERS[env_id], env, seed, **variation) for seed in range(3)]
+    scripted = [play_plan(env, seed, **variation) for seed in range(3)]
     assert sum(episode.steps for episode in ours) < 1.4 * sum(episode.steps for episode in scripted)
     env.close()
 

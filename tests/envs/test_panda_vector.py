@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-import progpolicy_envs
-from progpolicy_envs.planners.panda import CONTROLLERS
+from progpolicy_envs import DOMAINS
 
+IDS = [domain.id for domain in DOMAINS.values() if domain.simulation]
 SIZES = (1, 3, 8)
 
 
@@ -25,9 +25,9 @@ def flat(observation: Any) -> np.ndarray:
 
 @pytest.mark.parametrize("observation", ["flat", "goal"])
 @pytest.mark.parametrize("reward_type", ["dense", "sparse"])
-@pytest.mark.parametrize("env_id", list(CONTROLLERS))
+@pytest.mark.parametrize("env_id", IDS)
 def test_batched_equals_single_step_for_step(env_id, reward_type, observation):
-    size = progpolicy_envs.get_domain(env_id).size
+    size = DOMAINS[env_id].size
     arguments = {"observation": observation, "reward_type": reward_type, "max_episode_steps": 70}
     batched = make_vec(env_id, **arguments)
     singles = [gym.make(env_id, disable_env_checker=True, **arguments) for _ in SIZES]
@@ -41,7 +41,7 @@ def test_batched_equals_single_step_for_step(env_id, reward_type, observation):
             np.testing.assert_array_equal(flat(observations)[row], flat(single))
             assert infos["variation"][row] == info["variation"]
         for step in range(150):
-            actions = np.array([CONTROLLERS[env_id](row) for row in flat(observations)])
+            actions = np.array([next(env.unwrapped.plan()) for env in singles])
             if step % 10 == 9:
                 actions = rng.uniform(-1.3, 1.3, actions.shape).astype(np.float32)
             observations, rewards, terminated, truncated, infos = batched.step(actions)

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import progpolicy_envs
+from progpolicy_envs import DOMAINS
 from progpolicy_envs.variation import ChoiceParameter, IntParameter, VariationSpace
 
 SPACE = VariationSpace(
@@ -52,7 +52,7 @@ def extremes(env_id: str) -> list[tuple[str, Any]]:
     return values
 
 
-PLANNING = [env_id for env_id in progpolicy_envs.DOMAINS if not env_id.startswith("Panda")]
+PLANNING = [domain.id for domain in DOMAINS.values() if not domain.simulation]
 
 
 @pytest.mark.parametrize("env_id", PLANNING)

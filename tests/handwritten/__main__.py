@@ -12,10 +12,9 @@ from pathlib import Path
 
 import gymnasium as gym
 
-from progpolicy_envs import DOMAINS, HIKING_EGOCENTRIC, get_domain
-from progpolicy_envs.planners.panda import CONTROLLERS
+from progpolicy_envs import get_domain
 from sb3_progpolicy.programs.files import write_atomically
-from tests.handwritten.evaluate import play, play_batch, play_controller, size_of
+from tests.handwritten.evaluate import play, play_batch, play_plan, size_of
 from tests.handwritten.hanoi import hanoi_program
 from tests.handwritten.hiking import egocentric_program, map_program
 from tests.handwritten.panda import PROGRAMS
@@ -28,23 +27,16 @@ def planning(n_seeds: int) -> None:
     """Print one line per planning domain and set of variations."""
     print(f"seeds 0 to {n_seeds - 1} of every variation; ratio = all steps / all of the planner's steps\n")
     print(f"{'domain':<26}{'branches':>9}{'set':>8}{'success':>9}{'steps':>8}{'planner':>9}{'ratio':>7}")
-    for domain, program in (
-        (DOMAINS["Hanoi-v0"], hanoi_program()),
-        (DOMAINS["Hiking-v0"], map_program()),
-        (HIKING_EGOCENTRIC, egocentric_program()),
-        (DOMAINS["Stacking-v0"], stacking_program()),
-    ):
-        name = " ".join([domain.id, *domain.arguments.values()])
+    for program in (hanoi_program(), map_program(), egocentric_program(), stacking_program()):
+        domain = get_domain(program.metadata["env"])
         for part, variations in (("train", domain.train), ("unseen", domain.unseen)):
             episodes = [
-                episode
-                for variation in variations
-                for episode in play_batch(program, domain.id, n_seeds, **domain.arguments, **variation)
+                episode for variation in variations for episode in play_batch(program, domain.id, n_seeds, **variation)
             ]
             success = sum(episode.success for episode in episodes) / len(episodes)
             steps, optimal = (sum(getattr(e, what) for e in episodes) / len(episodes) for what in ("steps", "optimal"))
             print(
-                f"{name:<26}{size_of(program)[1]:>9}{part:>8}{success:>9.1%}{steps:>8.2f}{optimal:>9.2f}"
+                f"{domain.id:<26}{size_of(program)[1]:>9}{part:>8}{success:>9.1%}{steps:>8.2f}{optimal:>9.2f}"
                 f"{steps / optimal:>7.3f}"
             )
 
@@ -63,7 +55,7 @@ def panda(n_seeds: int, sizes: list[int]) -> list[str]:
             variation = {domain.size: size}
             part = "train" if variation in domain.train else "unseen"
             ours = [play(program, env, seed, **variation) for seed in range(n_seeds)]
-            scripted = [play_controller(CONTROLLERS[env_id], env, seed, **variation) for seed in range(n_seeds)]
+            scripted = [play_plan(env, seed, **variation) for seed in range(n_seeds)]
             both = [(a.steps, b.steps) for a, b in zip(ours, scripted, strict=True) if a.success and b.success]
             comparison = "- | - | - | -"
             if both:

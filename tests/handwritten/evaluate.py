@@ -1,6 +1,5 @@
 """Run programs crisply on environments, with the history of section 2.4, and count their steps."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,16 +55,16 @@ def play(program: Program | Player, env: gym.Env[Any, Any], seed: int | None = N
     return Episode(info["is_success"], steps, optimal)
 
 
-def play_controller(
-    control: Callable[[NDArray[np.float32]], NDArray[np.float32]], env: gym.Env[Any, Any], seed: int, **options: Any
-) -> Episode:
-    """Run one episode with a controller that maps an observation to an action and remembers nothing."""
-    observation, info = env.reset(seed=seed, options=options)
-    ended, steps = False, 0
-    while not ended:
-        observation, _, terminated, truncated, info = env.step(control(observation))
-        ended, steps = terminated or truncated, steps + 1
-    return Episode(info["is_success"], steps, info.get("optimal_steps"))
+def play_plan(env: gym.Env[Any, Any], seed: int, **options: Any) -> Episode:
+    """Run one episode with the actions of the environment's planner."""
+    _, info = env.reset(seed=seed, options=options)
+    optimal, steps = info.get("optimal_steps"), 0
+    for action in env.unwrapped.plan():  # type: ignore[attr-defined]
+        *_, truncated, info = env.step(action)
+        steps += 1
+        if truncated:
+            break
+    return Episode(info["is_success"], steps, optimal)
 
 
 def play_batch(

@@ -1,14 +1,13 @@
 """Hiking by the right-hand rule: once for any map, from the window around the hiker, and once for one known map."""
 
-import gymnasium as gym
 import numpy as np
 
-import progpolicy_envs  # noqa: F401 (registers the ids)
-from progpolicy_envs.hiking import ACTION_NAMES
+from progpolicy_envs.hiking import HikingEgoEnv, HikingEnv
 from progpolicy_envs.layouts import LAYOUTS, NEIGHBOURS, Layout
 from sb3_progpolicy.programs.syntax import Program
 from tests.handwritten.build import Builder
 
+ACTION_NAMES = HikingEnv.action_names
 AHEAD = {"north": "window[-1,+0]", "east": "window[+0,+1]", "south": "window[+1,+0]", "west": "window[+0,-1]"}
 #: Preference for a turn, counted clockwise from straight on: straight on, right, back, left.
 PREFERENCE = (2.0, 3.0, 0.0, 1.0)
@@ -17,13 +16,13 @@ OPEN = 3.5  # more than the largest preference, so that no blocked cell is chose
 
 def egocentric_program() -> Program:
     """Return one affine controller: the right-hand rule, a star next to the hiker first."""
-    builder = Builder(gym.make("Hiking-v0", observation="egocentric"))
+    builder = Builder(HikingEgoEnv())
     scores: dict[str, dict[str, float]] = {}
     for direction, name in enumerate(ACTION_NAMES):
         scores[name] = {AHEAD[name]: OPEN}
         for previous, previous_name in enumerate(ACTION_NAMES):
             scores[name][f"previous {previous_name}"] = PREFERENCE[(direction - previous) % 4]
-    return builder.program(builder.controller(scores), env="Hiking-v0")
+    return builder.program(builder.controller(scores), env="HikingEgo-v0")
 
 
 def right_hand_turn(layout: Layout, cell: int, heading: int) -> int:
@@ -51,7 +50,7 @@ def map_program(layout: str = "valley") -> Program:
     A star on another turning cell of the branch adds an eighth to that cell's way, which does no harm while fewer
     than eight of them agree.
     """
-    builder = Builder(gym.make("Hiking-v0", observation="map"))
+    builder = Builder(HikingEnv())
     controllers = []
     for heading, name in enumerate(ACTION_NAMES):
         scores: dict[str, dict[str, float]] = {way: {} for way in ACTION_NAMES}

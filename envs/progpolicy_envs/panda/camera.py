@@ -9,7 +9,7 @@ import pybullet
 
 from progpolicy_envs.panda.scene import MAX_OBJECTS, Scene
 from progpolicy_envs.panda.shapes import visual_drum
-from progpolicy_envs.panda.tasks import Reach, Slide, Stack, Task
+from progpolicy_envs.panda.tasks import Mark, Task
 from progpolicy_envs.rendering import Frame
 
 WIDTH, HEIGHT = 480, 360
@@ -34,7 +34,7 @@ def _pale(colour: tuple[float, float, float]) -> list[float]:
 
 
 class Camera:
-    """Draws the scene, the targets in their objects' colours, and black pins over the object in focus and its target.
+    """Draws the scene, the task's marks in their objects' colours, and black pins over what is in focus.
 
     What it adds to the world can be seen but not touched.
 
@@ -47,10 +47,9 @@ class Camera:
         self.task = task
         for body, colour in zip(scene.objects, COLOURS, strict=False):
             pybullet.changeVisualShape(body, -1, rgbaColor=[*colour, 1], physicsClientId=scene.client)
-        self._targets = [self._target(colour) for colour in COLOURS]
-        # A delivered puck is off the table; the picture still shows it where it was delivered.
-        self._delivered = [self._puck(colour) for colour in COLOURS] if isinstance(task, Slide) else []
-        self._pins = [self._pin() for _ in range(1 if isinstance(task, Reach) else 2)]
+        #: For each mark of the task one body in each colour.
+        self._marks = [[self._mark(mark, colour) for colour in COLOURS] for mark in task.marks]
+        self._pins = [self._pin() for _ in range(2)]
         self._floor = self._ghost(pybullet.GEOM_BOX, [0.55, 0.6, 0.64, 1.0], halfExtents=[3, 3, 0.01])
         self._put(self._floor, (0.0, 0.0, -0.42))
 
@@ -60,16 +59,13 @@ class Camera:
         :param focus: index of the object in focus
         """
         task = self.task
-        for index, ghost in enumerate(self._targets[:MAX_OBJECTS]):
-            shown = index < len(task.targets) and not (isinstance(task, Reach) and task.finished[index])
-            self._put(ghost, self._target_position(index) if shown else _AWAY)
-        for index, ghost in enumerate(self._delivered):
-            shown = index < len(task.targets) and task.finished[index]
-            self._put(ghost, task.positions[index] if shown else _AWAY)
-        marked = [self._target_position(focus)]
-        if not isinstance(task, Reach):
-            marked.append(task.positions[focus])
-        for (head, needle), (x, y, z) in zip(self._pins, marked, strict=True):
+        for index in range(MAX_OBJECTS):
+            shown = index < len(task.targets)
+            positions = task.mark_positions(index) if shown else [None] * len(self._marks)
+            for bodies, position in zip(self._marks, positions, strict=True):
+                self._put(bodies[index], position or _AWAY)
+        for (head, needle), position in zip(self._pins, task.pin_positions(focus), strict=False):
+            x, y, z = position or _AWAY
             self._put(head, (x, y, z + 0.085))
             self._put(needle, (x, y, z + 0.05))
         middle = (self.scene.table.low_x + self.scene.table.high_x) / 2
@@ -92,26 +88,13 @@ class Camera:
         head = self._ghost(pybullet.GEOM_SPHERE, [*MARKER_COLOUR, 1.0], radius=0.012)
         return head, self._ghost(pybullet.GEOM_CYLINDER, [*MARKER_COLOUR, 1.0], radius=0.0035, length=0.06)
 
-    def _puck(self, colour: tuple[float, float, float]) -> int:
-        radius, _, half_height = Slide.kind.half_extents
-        return self._drum([*colour, 1.0], radius, 2 * half_height)
-
-    def _target(self, colour: tuple[float, float, float]) -> int:
-        if isinstance(self.task, Reach):
-            return self._ghost(pybullet.GEOM_SPHERE, [*colour, 1.0], radius=0.02)
-        if isinstance(self.task, Stack):
-            return self._ghost(pybullet.GEOM_BOX, [*colour, 1.0], halfExtents=[0.01, 0.01, 0.01])
-        return self._drum(_pale(colour), self.task.tolerance, 0.002)
-
-    def _target_position(self, index: int) -> tuple[float, float, float]:
-        x, y, z = self.task.targets[index]
-        if isinstance(self.task, Stack):
-            # The pattern for the tower stands beside it, where the gripper does not hide it.
-            return x + 0.12, y, 0.01 + 0.02 * index
-        return (x, y, z) if isinstance(self.task, Reach) else (x, y, 0.001)
-
-    def _drum(self, colour: list[float], radius: float, length: float) -> int:
-        return self._body(visual_drum(radius, length, **self._look(colour)))
+    def _mark(self, mark: Mark, colour: tuple[float, float, float]) -> int:
+        shade, (radius, _, half_height) = _pale(colour) if mark.pale else [*colour, 1.0], mark.half_extents
+        if mark.shape == "drum":
+            return self._body(visual_drum(radius, 2 * half_height, **self._look(shade)))
+        if mark.shape == "box":
+            return self._ghost(pybullet.GEOM_BOX, shade, halfExtents=list(mark.half_extents))
+        return self._ghost(pybullet.GEOM_SPHERE, shade, radius=radius)
 
     def _ghost(self, geometry: int, colour: list[float], **size: float | list[float]) -> int:
         return self._body(pybullet.createVisualShape(geometry, **self._look(colour), **size))

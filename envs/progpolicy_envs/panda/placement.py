@@ -13,7 +13,7 @@ from progpolicy_envs.panda.robot import BASE_POSITION
 Points = NDArray[np.float64]
 #: Two or three coordinates, metres.
 Place = Sequence[float]
-#: Tells of a start and a target whether they fit those of the objects before, which are given after them.
+#: Whether a start and a target, the first two arguments, fit those of the objects before, the last two.
 Fits = Callable[[Place, Place, Sequence[Place], Sequence[Place]], bool]
 
 #: Tells the same of many candidates: arrays ``(n, d)`` in, ``(n,)`` out.
@@ -30,18 +30,18 @@ def sample_in_order(
 ) -> tuple[Points, Points]:
     """Draw starts and targets one object after the other, each so that it fits those before it.
 
-    Candidates are drawn by the batch, but tried one by one up to the first that fits: most fail a cheap test at once,
-    which takes less time with plain numbers than with small arrays. Where the first batch has none, all further ones
-    that an object may have are screened together. Where an object finds no place, all begin anew.
+    Candidates are drawn in batches, but tried one by one until one fits: most fail a cheap test, for which numbers are
+    faster than small arrays. If none of an object's first batch fits, all its other batches are screened together.
+    If an object finds no place, everything is drawn again.
 
     :param n_objects: number of objects
     :param propose: given a number, returns as many candidate starts and targets, ``(number, d)`` each
     :param fits: whether a candidate fits
-    :param screen: leaves few of many candidates, among them all that fit. Given one, more may be drawn than are used
+    :param screen: keeps few of many candidates, but all that fit; with it, more may be drawn than are used
     :return: starts and targets ``(n_objects, d)``
     """
     while True:
-        propose(1)  # not used; without it the positions that belong to a seed would be others than they have been
+        propose(1)  # not used, but drawn so that every seed gives the positions that it has always given
         starts: list[Place] = []
         targets: list[Place] = []
         drawn: list[tuple[Points, Points]] = []

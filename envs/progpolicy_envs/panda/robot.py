@@ -21,7 +21,7 @@ _JOINTS = (*_ARM, *_FINGERS)
 _GRIPPER = 11
 _FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 120.0, 120.0, 170.0, 170.0)
 _NEUTRAL = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79, 0.0, 0.0)
-# Limits of the joints in the URDF, drawn in a little so that the motors do not work against the stops.
+# The joints' limits in the URDF, narrowed a little so that the motors do not press against the stops.
 _LOWER = tuple(low + 0.01 for low in (-2.9671, -1.8326, -2.9671, -3.1416, -2.9671, -0.0873, -2.9671))
 _UPPER = tuple(high - 0.01 for high in (2.9671, 1.8326, 2.9671, 0.0, 2.9671, 3.8223, 2.9671))
 # PyBullet's position motor removes this share of the error in each physics step of 1/240 s; see motor_gain. Stiffer
@@ -33,7 +33,7 @@ _SHOULDER, _UPPER_ARM, _FOREARM, _ELBOW, _WRIST, _HAND = 0.333, 0.316, 0.384, 0.
 _TO_ELBOW, _TO_WRIST = math.hypot(_UPPER_ARM, _ELBOW), math.hypot(_FOREARM, _ELBOW)
 _ELBOW_ANGLES = math.atan2(_ELBOW, _UPPER_ARM), math.atan2(_ELBOW, _FOREARM)
 _BENT = sum(_ELBOW_ANGLES)
-# The gripper keeps this far from the axis on which the arm turns, where small ways would be large turns.
+# The gripper stays this far from the axis on which the arm turns: nearer, a small displacement is a large turn.
 _NEAREST = 0.2
 
 
@@ -52,8 +52,8 @@ def arm_angles(x: float, y: float, z: float) -> list[float]:
     """Return the arm's joint angles that bring the gripper to a place, pointing down, its fingers opening along y.
 
     Of the seven joints the third and the fifth stay at 0. The arm then moves in a vertical plane, where shoulder, elbow
-    and wrist form a triangle: the solution is exact and the same whatever way the arm came. Places out of reach are
-    drawn in along the line to the shoulder.
+    and wrist form a triangle: the solution is exact and does not depend on the arm's present angles. A place out of
+    reach is moved towards the shoulder until it is in reach.
 
     :param x: metres
     :param y: metres
@@ -83,7 +83,7 @@ def arm_angles(x: float, y: float, z: float) -> list[float]:
 
 
 def _corner(one: float, other: float, opposite: float) -> float:
-    """Return the angle between two sides of a triangle, 0 or pi where the third is too short or too long for one."""
+    """Return the angle between two sides of a triangle; 0 or pi where the third is too short or too long."""
     cosine = (one * one + other * other - opposite * opposite) / (2 * one * other)
     return math.acos(cosine) if -1.0 < cosine < 1.0 else math.pi * (cosine < 0.0)
 
@@ -141,7 +141,7 @@ class PandaRobot:
         self._drive(_NEUTRAL)
 
     def read(self) -> None:
-        """Take over the state of the simulation; two calls of PyBullet in all."""
+        """Read the gripper's position, velocity and width from the simulation, in two calls of PyBullet."""
         left, right = pybullet.getJointStates(self.body, _FINGERS, self.client)
         link = pybullet.getLinkState(self.body, _GRIPPER, True, False, self.client)
         self.position = link[0]

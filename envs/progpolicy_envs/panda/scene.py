@@ -1,4 +1,4 @@
-"""The world around the robot: table and coloured objects in one PyBullet client, stepped, read and put back."""
+"""The world around the robot: table and coloured objects in one PyBullet client, simulated, read and reset."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TABLE_HEIGHT = 0.4
 HOLD_DISTANCE = 0.03
 #: An object whose centre is this far above where it lies on the table has been lifted, metres.
 LIFT_HEIGHT = 0.005
-#: An object that moves less than this in one control step is still, metres; so many such steps and it sleeps.
+#: An object that moves less than this in one control step is still, metres; after so many such steps it is deactivated.
 STILL_MOTION, STILL_STEPS = 1e-5, 3
 #: An object whose centre is this far below the table's top has left the table, metres.
 FALL_DEPTH = 0.05
@@ -38,9 +38,9 @@ _STILL = (0.0, 0.0, 0.0)
 class Physics:
     """How finely the world is simulated.
 
-    What lies on the table is pushed about well enough by coarse steps with few iterations of the contact solver. With
-    these a block slips out of the fingers when it is lifted, and a tower trembles until it falls; so while an object is
-    between the fingers or off the table the steps are finer and the iterations more, and the world is called delicate.
+    Coarse steps with few iterations of the contact solver are good enough for pushing objects over the table. But with
+    them a block slips out of the fingers when it is lifted, and a tower trembles until it falls. So the world is called
+    delicate while an object is between the fingers or off the table, and then has finer steps with more iterations.
 
     :param frequency: physics steps per second
     :param substeps: physics steps in one control step, which therefore takes ``substeps / frequency`` seconds
@@ -48,12 +48,12 @@ class Physics:
     :param delicate_substeps: physics steps in one control step while the world is delicate
     :param delicate_iterations: iterations of the contact solver while the world is delicate
     :param sleeping: whether bodies at rest are left out of the simulation until something touches them; an object
-        falls asleep after a tenth of a second of rest, for which Bullet itself would wait two seconds
+        is put to sleep after a tenth of a second of rest, where Bullet would wait two seconds
     :param contact_margin: by how much all bodies are enlarged to find those that may touch, metres, while the world is
-        not delicate; a small one lets more of what lies near the hand sleep
-    :param stock_bodies: whether table and objects are what PyBullet makes of them by itself, as in panda-gym:
-        multibodies, each a box or a cylinder. Otherwise the table, and every object whose kind does not ask for a
-        multibody, are rigid bodies, and their shapes are such that what slides does not sink in
+        not delicate; with a small margin more of the objects near the hand can sleep
+    :param stock_bodies: whether table and objects are PyBullet's default, as in panda-gym: multibodies, each a box or a
+        cylinder. Otherwise the table, and every object whose kind does not ask for a multibody, are rigid bodies, with
+        shapes that do not sink in when they slide
     """
 
     frequency: int = 120
@@ -106,8 +106,8 @@ class ObjectKind:
     :param half_extents: half the size along x, y and z, metres; a cylinder's radius is the first
     :param mass: kg
     :param friction: lateral friction coefficient; PyBullet multiplies those of the two bodies in contact
-    :param multibody: whether PyBullet computes it as a multibody, of which towers are steadier, or as a rigid body of
-        the plain kind, whose contacts take less work to solve
+    :param multibody: whether PyBullet computes it as a multibody, which makes steadier towers, or as a plain rigid
+        body, whose contacts take less work to solve
     """
 
     shape: Literal["box", "cylinder"]
@@ -187,7 +187,7 @@ class Scene:
             if stock
             else bearing_box(half, client)
         )
-        # A rigid body of the plain kind: with a multibody, just as fixed, contacts take 40 % more work to solve.
+        # A plain rigid body: contacts with a multibody, though it is fixed too, take 40 % more work to solve.
         body = pybullet.createMultiBody(
             baseCollisionShapeIndex=shape,
             baseVisualShapeIndex=pybullet.createVisualShape(pybullet.GEOM_BOX, physicsClientId=client, **look)
@@ -219,7 +219,7 @@ class Scene:
             pybullet.changeDynamics(body, -1, kind.mass, localInertiaDiagonal=inertia, physicsClientId=client)
         pybullet.changeDynamics(body, -1, lateralFriction=kind.friction, physicsClientId=client)
         if not multibody:
-            # What a multibody has from the start.
+            # A multibody has this damping by default.
             pybullet.changeDynamics(body, -1, linearDamping=0.04, angularDamping=0.04, physicsClientId=client)
         if self.physics.sleeping:
             self._activate(body, pybullet.ACTIVATION_STATE_ENABLE_SLEEPING)
@@ -249,7 +249,7 @@ class Scene:
         return self.kind.height if self.kind else 0.0
 
     def place(self, positions: Sequence[Point]) -> None:
-        """Put the robot into its neutral pose and objects onto the table, all at rest; the rest of the world is as new.
+        """Put the robot into its neutral pose and objects onto the table, all at rest, as in a new world.
 
         Objects that lie on the table start asleep.
 
@@ -259,8 +259,8 @@ class Scene:
         for index, body in enumerate(self.objects):
             self._move(body, _parking(index))
         self.robot.place()
-        # Apart from each other nothing touches: contacts and their warm starts are forgotten. A body takes a step to
-        # wake up and another to fall asleep, so that all enter the episode alike, asleep before anything moves them.
+        # Parked objects touch nothing, so Bullet drops all contacts and what it kept to solve them. Waking and falling
+        # asleep take a body one step each, after which all objects start every episode in the same state.
         self._set_steps(self.physics.substeps, 1)
         for state in (pybullet.ACTIVATION_STATE_WAKE_UP, pybullet.ACTIVATION_STATE_SLEEP):
             for body in self.objects:
@@ -286,15 +286,15 @@ class Scene:
         self._activate(body, pybullet.ACTIVATION_STATE_SLEEP)
 
     def step(self) -> None:
-        """Simulate one control step and take over what comes of it."""
+        """Simulate one control step and read the state after it."""
         self.simulate()
-        self.take_over()
+        self.sync_state()
 
     def simulate(self) -> None:
         """Compute the physics of one control step."""
         step, set_engine, client = pybullet.stepSimulation, pybullet.setPhysicsEngineParameter, self.client
         other_margin = self._margin != BULLET_MARGIN
-        # Bullet keeps the margin in a variable of the whole process, so other worlds get theirs back at once.
+        # Bullet has one margin for the whole process, so it is set back at once for other worlds.
         if other_margin:
             set_engine(contactBreakingThreshold=self._margin, physicsClientId=client)
         try:
@@ -304,12 +304,12 @@ class Scene:
             if other_margin:
                 set_engine(contactBreakingThreshold=BULLET_MARGIN, physicsClientId=client)
 
-    def take_over(self) -> None:
-        """Read the state after the physics and let things that lie still fall asleep."""
+    def sync_state(self) -> None:
+        """Read the state after the physics, and deactivate the objects that lie still."""
         before = self.positions
         self.read()
         if self.physics.sleeping and before:
-            self._lull(before)
+            self._deactivate(before)
 
     def _is_delicate(self) -> bool:
         gripper, lifted = self.robot.position, self._lifted
@@ -329,18 +329,18 @@ class Scene:
         pybullet.setPhysicsEngineParameter(numSolverIterations=iterations, physicsClientId=self.client)
 
     def _set_steps(self, calls: int, in_one_call: int) -> None:
-        """Make a control step of several calls of the simulation, each of which makes several physics steps.
+        """Divide a control step into calls of the simulation, each of which makes several physics steps.
 
-        Several physics steps in one call take a fifth less time than in as many calls. Bullet hands out weights at the
-        beginning of a call, so that a rigid body which is woken in one has its weight from the next call on, within a
-        control step; all else is the same to the last bit.
+        Several physics steps in one call take a fifth less time than in as many calls. The result is the same to the
+        last bit, but for a rigid body that is woken during a call: Bullet applies gravity at the beginning of a call,
+        so that the body has no weight until the next one, which is at most a control step later.
         """
         self._calls = range(calls)
         seconds = self.physics.control_step / calls
         self.robot.set_time_step(seconds / in_one_call, in_one_call)
         pybullet.setPhysicsEngineParameter(fixedTimeStep=seconds, numSubSteps=in_one_call, physicsClientId=self.client)
 
-    def _lull(self, before: Sequence[Point]) -> None:
+    def _deactivate(self, before: Sequence[Point]) -> None:
         """Put the objects to sleep that have not moved for a while; whatever touches one wakes it.
 
         :param before: the objects' centres one control step ago
@@ -356,7 +356,7 @@ class Scene:
                     self._activate(self.objects[index], pybullet.ACTIVATION_STATE_SLEEP)
 
     def read(self) -> None:
-        """Take over the state of the robot and the positions of all objects in use; simulate as finely as they need."""
+        """Read the robot and the positions of the objects in use, and choose how finely to simulate them."""
         self.robot.read()
         read, client = pybullet.getBasePositionAndOrientation, self.client
         self._poses = [read(body, client) for body in self._used]
@@ -369,7 +369,7 @@ class Scene:
         """Return the full state of one object.
 
         :param index: which object
-        :param position: given out as its centre; by default where it is
+        :param position: returned as its centre; by default where it is
         """
         velocity, spin = pybullet.getBaseVelocity(self.objects[index], self.client)
         return ObjectState(position or self.positions[index], self._poses[index][1], velocity, spin)

@@ -1,4 +1,4 @@
-"""Shapes that PyBullet's software renderer draws, or its contact search handles, badly by themselves."""
+"""Replacements for shapes of PyBullet that its software renderer or its contact search handles badly."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from typing import Any
 import pybullet
 
 _SEGMENTS = 32
-#: A compound of one shape is made the shape itself unless that is off the centre, metres.
-_HAIR = 1e-9
-#: By how much a drum's foot stands out of it, metres.
+#: How far a compound's only shape is off the centre, metres; PyBullet replaces a compound of one centred shape by that.
+_EPSILON = 1e-9
+#: How far a drum's foot stands out of its end, metres.
 _FOOT = 0.001
-#: Half the side of a drum's square foot to its radius; the corners stay just inside.
+#: Half the side of a drum's square foot, divided by the radius; the corners stay just inside the circle.
 _FOOT_SIZE = 0.7
 
 
 def bearing_box(half_extents: Sequence[float], client: int) -> int:
     """Return a collision shape: a box on which things slide without tilting.
 
-    Between two boxes PyBullet remembers at most four points of contact. It adds those of the step first and drops those
-    that have slid away afterwards, so that a sliding box is left with one or two, tilts and digs in. Between a box and
-    a compound it drops first.
+    Between two boxes PyBullet keeps at most four points of contact. It first adds those of the present step and then
+    drops those that have slid away, so that a sliding box is left with one or two, tilts and digs in. Between a box and
+    a compound it drops before it adds.
 
     :param half_extents: half the size along x, y and z, metres
     :param client: the physics client
@@ -30,7 +30,7 @@ def bearing_box(half_extents: Sequence[float], client: int) -> int:
     shape: int = pybullet.createCollisionShapeArray(
         shapeTypes=[pybullet.GEOM_BOX],
         halfExtents=[list(half_extents)],
-        collisionFramePositions=[[0.0, 0.0, _HAIR]],
+        collisionFramePositions=[[0.0, 0.0, _EPSILON]],
         physicsClientId=client,
     )
     return shape
@@ -39,8 +39,8 @@ def bearing_box(half_extents: Sequence[float], client: int) -> int:
 def footed_drum(radius: float, length: float, client: int) -> int:
     """Return a collision shape: an upright cylinder that stands on a square foot, at both ends, a millimetre high.
 
-    For a cylinder PyBullet finds one point of contact in a step. Lying still it gathers four in time, but sliding at
-    0.4 m/s, in steps of 1/120 s, it had one, at its rim, and sank 11 mm into the table. A box has four at once.
+    For a cylinder PyBullet finds one point of contact in a step. At rest the points add up to four, but sliding at
+    0.4 m/s, in steps of 1/120 s, a cylinder had one, at its rim, and sank 11 mm into the table. A box has four at once.
 
     :param radius: metres
     :param length: metres, from end to end
@@ -58,7 +58,7 @@ def footed_drum(radius: float, length: float, client: int) -> int:
 
 
 def drum_inertia(mass: float, radius: float, length: float) -> tuple[float, float, float]:
-    """Return the moments of inertia of an upright cylinder about its axes, kg m^2; PyBullet takes a compound for a box.
+    """Return the moments of inertia of an upright cylinder, kg m^2; for a compound PyBullet computes those of a box.
 
     :param mass: kg
     :param radius: metres
@@ -71,8 +71,8 @@ def drum_inertia(mass: float, radius: float, length: float) -> tuple[float, floa
 def visual_drum(radius: float, length: float, **look: Any) -> int:
     """Return a visual shape: an upright cylinder with flat ends.
 
-    The renderer gives PyBullet's own cylinders one normal for the end and the side of an edge, so that a flat one
-    looks like a ball and a disc like a cone. Here each has normals of its own.
+    PyBullet's own cylinders have one normal at an edge for the end and the side, so that the renderer makes a flat one
+    look like a ball and a disc like a cone. Here ends and side have normals of their own.
 
     :param radius: metres
     :param length: metres, from end to end

@@ -1,11 +1,12 @@
-"""The four tasks: where things start, when an object is finished, and from where the gripper works on it."""
+"""The four tasks: where things start, when an object is finished, where the gripper has to be, what pictures show."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,17 +28,36 @@ from progpolicy_envs.panda.robot import BASE_POSITION
 from progpolicy_envs.panda.scene import FALL_DEPTH, ObjectKind, Point, Scene, Table
 
 
+@dataclass(frozen=True)
+class Mark:
+    """A shape that pictures show for each object, in the object's colour, and that nothing in the world touches.
+
+    :param shape: ``"sphere"``, ``"box"`` or ``"drum"``, which is an upright cylinder
+    :param half_extents: half the size along x, y and z, metres; a radius is the first
+    :param pale: whether the colour is made lighter
+    """
+
+    shape: Literal["sphere", "box", "drum"]
+    half_extents: tuple[float, float, float]
+    pale: bool = False
+
+
+_DISC = Mark("drum", (0.05, 0.05, 0.001), pale=True)
+
+
 class Task(ABC):
     """One task and its state in the running episode.
 
-    A few numbers are read at every step, so they are plain floats rather than arrays: ``positions``, of what is to be
-    brought to the targets, ``targets`` and ``finished`` have one entry per object.
+    ``positions`` (of what has to come to the targets), ``targets`` and ``finished`` have one entry per object. They are
+    read at every step, so they are lists of plain floats, which are faster than small arrays.
     """
 
     table: ClassVar[Table] = Table()
     kind: ClassVar[ObjectKind | None] = None
     #: Distance from the target within which an object counts as there, metres.
     tolerance: ClassVar[float] = 0.05
+    #: What pictures show of each object besides itself; the first shows its target.
+    marks: ClassVar[tuple[Mark, ...]] = (_DISC,)
 
     def __init__(self) -> None:
         self.positions: list[Point] = []
@@ -58,7 +78,7 @@ class Task(ABC):
         self.positions = self._positions(scene)
 
     def update(self, scene: Scene) -> None:
-        """Take over the state of the world after a control step."""
+        """Read the state of the world after a control step."""
         self.positions = self._positions(scene)
         self.finished = self._finished(scene)
 
@@ -76,7 +96,7 @@ class Task(ABC):
         return False
 
     def settled(self, scene: Scene, index: int) -> bool:
-        """Return whether an object, if it is at its target, is finished as far as all else is concerned."""
+        """Return whether an object would be finished if it were at its target: whether all other conditions hold."""
         return True
 
     @abstractmethod
@@ -84,8 +104,17 @@ class Task(ABC):
         """Return starts (``(n, 3)``; ``(0, 3)`` for Reach) and targets ``(n, 3)``."""
 
     @abstractmethod
-    def handle(self, index: int) -> Point | None:
-        """Return the point from which the gripper works on an object; ``None`` where there is none."""
+    def approach_point(self, index: int) -> Point | None:
+        """Return the point from which the gripper moves an object; ``None`` where there is none."""
+
+    def mark_positions(self, index: int) -> tuple[Point | None, ...]:
+        """Return where pictures show each of an object's :attr:`marks`; ``None`` for one that they do not show."""
+        x, y, _ = self.targets[index]
+        return ((x, y, 0.001),)
+
+    def pin_positions(self, index: int) -> tuple[Point | None, ...]:
+        """Return the points over which pictures show a pin while an object is in focus."""
+        return self.mark_positions(index)[0], self.positions[index]
 
     def _positions(self, scene: Scene) -> list[Point]:
         return scene.positions
@@ -102,6 +131,7 @@ class Task(ABC):
 class Reach(Task):
     """The gripper visits the targets in order."""
 
+    marks = (Mark("sphere", (0.02, 0.02, 0.02)),)
     separation = 0.1
 
     def sample(self, rng: np.random.Generator, n_objects: int) -> tuple[Points, Points]:
@@ -117,9 +147,17 @@ class Reach(Task):
 
         return np.zeros((0, 3)), sample_in_order(n_objects, propose, fits)[1]
 
-    def handle(self, index: int) -> Point | None:
+    def approach_point(self, index: int) -> Point | None:
         """Return ``None``: the gripper itself is what moves."""
         return None
+
+    def mark_positions(self, index: int) -> tuple[Point | None, ...]:
+        """Return the target, until it has been visited."""
+        return (None if self.finished[index] else self.targets[index],)
+
+    def pin_positions(self, index: int) -> tuple[Point | None, ...]:
+        """Return the target."""
+        return (self.targets[index],)
 
     def _positions(self, scene: Scene) -> list[Point]:
         return [scene.robot.position] * len(self.targets)
@@ -155,7 +193,7 @@ class Push(Task):
             if not (apart(start, before, self.separation) and apart(target, done, self.separation)):
                 return False
             behind = extended(start, target, self.run_up)
-            # While this block is pushed the earlier ones lie on their targets, and the other way round.
+            # While this block is pushed the earlier ones lie on their targets; while they are, it lies at its start.
             return reachable(behind) and all(
                 corridor_distance(behind, target, there) > self.clearance
                 and corridor_distance(extended(here, there, self.run_up), there, start) > self.clearance
@@ -165,16 +203,16 @@ class Push(Task):
         def screen(
             starts: Points, targets: Points, before: Sequence[Place], done: Sequence[Place]
         ) -> NDArray[np.bool_]:
-            # The same tests for many, a hair more generous since they round otherwise; the dear ones for what is left.
-            hair, base = 1e-9, np.array(BASE_POSITION[:2])
-            in_reach = 0.26 - hair, 0.74 + hair
-            keep = all_within(starts, targets, nearest - hair, farthest + hair)
+            # The same tests for many, wider by epsilon because arrays round differently; the expensive ones come last.
+            epsilon, base = 1e-9, np.array(BASE_POSITION[:2])
+            in_reach = 0.26 - epsilon, 0.74 + epsilon
+            keep = all_within(starts, targets, nearest - epsilon, farthest + epsilon)
             keep &= all_within(starts, base, *in_reach) & all_within(targets, base, *in_reach)
             if before:
-                heres, theres, far = np.array(before), np.array(done), self.separation - hair
+                heres, theres, far = np.array(before), np.array(done), self.separation - epsilon
                 keep[keep] = all_apart(starts[keep], heres, far)
                 keep[keep] = all_apart(targets[keep], theres, far)
-                starts, targets, clear = starts[keep, None], targets[keep, None], self.clearance - hair
+                starts, targets, clear = starts[keep, None], targets[keep, None], self.clearance - epsilon
                 behind, others = all_extended(starts, targets, self.run_up), all_extended(heres, theres, self.run_up)
                 free = corridor_distances(behind, targets, theres) > clear
                 free &= corridor_distances(others, theres, starts) > clear
@@ -183,7 +221,7 @@ class Push(Task):
 
         return _on_table(*sample_in_order(n_objects, propose, fits, screen), height=self.kind.height)
 
-    def handle(self, index: int) -> Point:
+    def approach_point(self, index: int) -> Point:
         """Return the point behind the block on the line to its target."""
         return _behind(self.positions[index], self.targets[index], 0.05)
 
@@ -193,6 +231,7 @@ class Slide(Task):
 
     table = Table(low_x=-0.8, high_x=0.6)
     kind = ObjectKind("cylinder", (0.03, 0.03, 0.015), mass=1.0, friction=0.04)
+    marks = (_DISC, Mark("drum", kind.half_extents))
     clearance = 0.08
     run_up = 0.06
     #: Half axes of the ellipse around a puck in which no other starts; longer along x, the way to the targets.
@@ -215,14 +254,14 @@ class Slide(Task):
 
         while True:
             starts = sample_in_order(n_objects, propose, fits)[0]
-            # The front pucks come first, so that they do not bar the way of those behind them.
+            # The front pucks come first, so that they are not in the way of those behind them.
             starts = starts[np.argsort(-starts[:, 0])]
             targets = self._sample_targets(rng, starts.tolist())
             if len(targets) == n_objects:
                 return _on_table(starts, np.array(targets), height=self.kind.height)
 
     def _sample_targets(self, rng: np.random.Generator, starts: Sequence[Place]) -> list[Place]:
-        """Return targets for the first pucks, x and y; fewer than there are pucks where one finds no place."""
+        """Return targets, x and y, in the order of the pucks, up to the first puck for which there is no place."""
         targets: list[Place] = []
         for index, start in enumerate(starts):
             candidates: list[Place] = rng.uniform((0.3, -0.29), (0.54, 0.29), (128, 2)).tolist()
@@ -244,7 +283,7 @@ class Slide(Task):
         )
 
     def update(self, scene: Scene) -> None:
-        """Take over the state of the world and take delivered pucks off the table."""
+        """Read the state of the world and take delivered pucks off the table."""
         before = self.finished
         super().update(scene)
         if self.finished != before:
@@ -252,9 +291,13 @@ class Slide(Task):
                 if new and not old:
                     scene.park(index)
 
-    def handle(self, index: int) -> Point:
+    def approach_point(self, index: int) -> Point:
         """Return the point behind the puck on the line to its target."""
         return _behind(self.positions[index], self.targets[index], 0.06)
+
+    def mark_positions(self, index: int) -> tuple[Point | None, ...]:
+        """Return the target's disc and, once the puck is delivered and off the table, the place where it was."""
+        return *super().mark_positions(index), self.positions[index] if self.finished[index] else None
 
     def _positions(self, scene: Scene) -> list[Point]:
         # A delivered puck keeps the place where it was delivered, although it is off the table.
@@ -273,6 +316,7 @@ class Stack(Task):
 
     kind = ObjectKind("box", (0.02, 0.02, 0.02), mass=1.0, friction=0.5, multibody=True)
     tolerance = 0.03
+    marks = (Mark("box", (0.01, 0.01, 0.01)),)
     #: A block that moves less than this in one control step is at rest, metres.
     rest_motion = 0.001
 
@@ -308,13 +352,18 @@ class Stack(Task):
         self._before = self.positions
 
     def update(self, scene: Scene) -> None:
-        """Take over the state of the world after a control step."""
+        """Read the state of the world after a control step."""
         self._before = self.positions
         super().update(scene)
 
-    def handle(self, index: int) -> Point:
+    def approach_point(self, index: int) -> Point:
         """Return the block's own position."""
         return self.positions[index]
+
+    def mark_positions(self, index: int) -> tuple[Point | None, ...]:
+        """Return a place in a small model of the tower, which stands beside it, where the gripper does not hide it."""
+        x, y, _ = self.targets[index]
+        return ((x + 0.12, y, 0.01 + 0.02 * index),)
 
     def settled(self, scene: Scene, index: int) -> bool:
         """Return whether the block is at rest and free of the gripper: fingertips above it, or beside it."""

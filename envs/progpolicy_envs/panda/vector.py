@@ -1,7 +1,7 @@
 """The batched form of the Panda environments: several simulations in one process, each part of a step for all of them.
 
-A step of one environment evicts much of Python from the processor's caches while it computes the physics, and the
-other way round. So first all arms get their commands, then the physics of all are computed, then all are read.
+Physics and Python evict each other from the processor's caches. So a step first gives all arms their commands, then
+computes the physics of all simulations, then reads all of them.
 """
 
 from __future__ import annotations
@@ -12,15 +12,16 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from progpolicy_envs.panda import PandaEnv, PandaPushEnv, PandaReachEnv, PandaSlideEnv, PandaStackEnv
-from progpolicy_envs.panda.env import Observation
+from progpolicy_envs.panda import make_push, make_reach, make_slide, make_stack
+from progpolicy_envs.panda.env import Observation, PandaEnv
+from progpolicy_envs.panda.goal import EntryPoint
 from progpolicy_envs.vector import DomainVectorEnv, Infos, check_num_envs
 
 
 class PandaVectorEnv(DomainVectorEnv):
     """N simulations stepped together, equal to N single environments step for step.
 
-    A subclass names the single form. ``infos`` of a step hold what a single one's info does, in arrays.
+    A subclass names what makes a single one. ``infos`` of a step hold the items of a single one's info, in arrays.
 
     :param num_envs: number of environments
     :param max_episode_steps: steps after which an episode is truncated; ``None`` for no limit
@@ -33,12 +34,13 @@ class PandaVectorEnv(DomainVectorEnv):
         "autoreset_mode": AutoresetMode.SAME_STEP,
         "render_modes": ["rgb_array"],
     }
-    env_class: ClassVar[type[PandaEnv]]
+    #: Makes one environment.
+    make_single: ClassVar[EntryPoint]
     observation_names: ClassVar[tuple[str, ...]] = PandaEnv.observation_names
     action_names: ClassVar[tuple[str, ...]] = PandaEnv.action_names
 
     def __init_subclass__(cls) -> None:
-        cls.variations = cls.env_class.variations
+        cls.variations = cls.make_single.variations
 
     def __init__(
         self,
@@ -54,7 +56,7 @@ class PandaVectorEnv(DomainVectorEnv):
         self.envs: list[PandaEnv] = []
         try:
             for _ in range(num_envs):
-                self.envs.append(self.env_class(render_mode=render_mode, **arguments))
+                self.envs.append(self.make_single(render_mode=render_mode, **arguments))
             first = self.envs[0]
             super().__init__(num_envs, first.observation_space, first.action_space, first.variation, max_episode_steps)
         except BaseException:
@@ -86,7 +88,7 @@ class PandaVectorEnv(DomainVectorEnv):
             env.scene.robot.act(numbers)
         for env in self.envs:
             env.scene.simulate()
-        observations, rewards, infos = zip(*[env.conclude() for env in self.envs], strict=True)
+        observations, rewards, infos = zip(*[env.post_physics_step() for env in self.envs], strict=True)
         self._observations = list(observations)
         batch = {name: np.array([info[name] for info in infos]) for name in infos[0]}
         return np.array(rewards), batch["is_success"] | batch["is_failure"], batch
@@ -107,22 +109,22 @@ class PandaVectorEnv(DomainVectorEnv):
 class PandaReachVectorEnv(PandaVectorEnv):
     """N :class:`~progpolicy_envs.panda.PandaReachEnv`; see :class:`PandaVectorEnv`."""
 
-    env_class: ClassVar[type[PandaEnv]] = PandaReachEnv
+    make_single: ClassVar[EntryPoint] = make_reach
 
 
 class PandaPushVectorEnv(PandaVectorEnv):
     """N :class:`~progpolicy_envs.panda.PandaPushEnv`; see :class:`PandaVectorEnv`."""
 
-    env_class: ClassVar[type[PandaEnv]] = PandaPushEnv
+    make_single: ClassVar[EntryPoint] = make_push
 
 
 class PandaSlideVectorEnv(PandaVectorEnv):
     """N :class:`~progpolicy_envs.panda.PandaSlideEnv`; see :class:`PandaVectorEnv`."""
 
-    env_class: ClassVar[type[PandaEnv]] = PandaSlideEnv
+    make_single: ClassVar[EntryPoint] = make_slide
 
 
 class PandaStackVectorEnv(PandaVectorEnv):
     """N :class:`~progpolicy_envs.panda.PandaStackEnv`; see :class:`PandaVectorEnv`."""
 
-    env_class: ClassVar[type[PandaEnv]] = PandaStackEnv
+    make_single: ClassVar[EntryPoint] = make_stack

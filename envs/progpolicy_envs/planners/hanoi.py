@@ -15,7 +15,7 @@ def plan(discs: Sequence[int], target: int) -> Iterator[Move]:
     and Maths*, theorem 2.7).
 
     :param discs: for each disc, the smallest first, the peg (0 to 2) on which it lies; any such list is a legal state
-    :param target: the peg (0 to 2) on which all discs shall lie
+    :param target: the peg (0 to 2) to which all discs go
     :return: pairs (peg from, peg to), as many as :func:`optimal_steps` says
     """
     misplaced = len(discs)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,9 +143,3 @@ def _approach(view: _View, clear: float) -> Action:
     if view.reach < 0.012 or (view.reach < 0.02 and abs(dz) < 0.05):
         return _action(dx, dy, dz, _OPEN)
     return _action(dx, dy, clear - view.gripper[2], _OPEN)
-
-
-#: The controller of each environment id.
-CONTROLLERS: Mapping[str, Callable[[Observation], Action]] = MappingProxyType(
-    {"PandaReach-v0": reach, "PandaPush-v0": push, "PandaSlide-v0": slide, "PandaStack-v0": stack}
-)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -118,31 +118,13 @@ def _random(env: Any) -> Act:
 
 
 def _planner(env: Any) -> Act:
-    """The domain's planner: a plan from the present state, or a controller that looks at every observation."""
-    from progpolicy_envs.planners.panda import CONTROLLERS
-
-    if env.spec.id in CONTROLLERS:
-        controller = CONTROLLERS[env.spec.id]
-        return lambda observation, reward, done: controller(observation)
-    planned = iter(_planned_actions(env.unwrapped))
-    return lambda observation, reward, done: next(planned)
-
-
-def _planned_actions(env: Any) -> Iterable[int]:
-    """The planner's actions from the environment's present state."""
-    from progpolicy_envs.planners import hanoi, hiking, stacking
-
-    if env.spec.id == "Hanoi-v0":
-        from progpolicy_envs.hanoi import MOVES
-
-        return (MOVES.index(move) for move in hanoi.plan(list(env.discs), env.target))
-    if env.spec.id == "Hiking-v0":
-        return hiking.plan(env.layout, env.hiker, sorted(env.stars))
-    if env.spec.id == "Stacking-v0":
-        return stacking.plan(env.gripper, env.plates)
+    """The actions of the environment's own planner."""
     from progpolicy_envs import DOMAINS
 
-    raise ValueError(f"--planner is not accepted for {env.spec.id}; it is for {', '.join(DOMAINS)}")
+    if not hasattr(env.unwrapped, "plan"):
+        raise ValueError(f"--planner is not accepted for {env.spec.id}; it is for {', '.join(DOMAINS)}")
+    planned = iter(env.unwrapped.plan())
+    return lambda observation, reward, done: next(planned)
 
 
 def _play(

@@ -1,0 +1,230 @@
+"""What Hiking-v0 and HikingEgo-v0 share: a hiker who collects stars on the pathways of a map, alone or in a batch."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from progpolicy_envs.layouts import (
+    DIRECTIONS,
+    LAYOUTS,
+    N_CELLS,
+    N_COLUMNS,
+    N_RANDOM_LAYOUTS,
+    NEIGHBOURS,
+    Layout,
+    random_layout,
+)
+from progpolicy_envs.planners import hiking as planner
+from progpolicy_envs.planning import PlanningEnv
+from progpolicy_envs.rendering import hiking_frame
+from progpolicy_envs.variation import ChoiceParameter, IntParameter, Variation, VariationSpace
+from progpolicy_envs.vector import PlanningVectorEnv
+
+MAX_STARS = 12
+RANDOM = "random"
+VARIATIONS = VariationSpace(
+    IntParameter("n_stars", 1, MAX_STARS, "number of stars"),
+    ChoiceParameter("layout", (*LAYOUTS, RANDOM), "the map; 'random' draws another one for every episode"),
+)
+STEP_REWARD, ILLEGAL_REWARD, STAR_REWARD = -0.01, -0.05, 1.0
+
+ACTION_NAMES = tuple(DIRECTIONS)
+BLOCKED, PATHWAY = -1.0, 0.0
+_OBSERVATION_SPACE = spaces.Box(-1.0, 1.0, (N_CELLS,), dtype=np.float32)
+_FIRST_LAYOUT = LAYOUTS["valley"]
+
+
+def draw_task(generator: np.random.Generator, variation: Variation) -> tuple[Layout, NDArray[np.int64]]:
+    """Draw the map, where it is random, and the cells of the stars.
+
+    :param generator: the environment's generator
+    :param variation: values of ``n_stars`` and ``layout``
+    """
+    name = variation["layout"]
+    layout = random_layout(int(generator.integers(N_RANDOM_LAYOUTS))) if name == RANDOM else LAYOUTS[name]
+    return layout, generator.permutation(layout.star_cells)[: variation["n_stars"]]
+
+
+class MapView:
+    """How a map is written in numbers, of which an observation shows some.
+
+    Rock, water and what lies beyond the map are -1, a pathway is 0; a subclass says what a star and the hiker are.
+    """
+
+    #: The number of a pathway cell with a star, and of the hiker's own cell.
+    star_value: ClassVar[float]
+    hiker_value: ClassVar[float]
+    #: How many numbers a map has, and which of them belongs to each of its 80 cells.
+    n_numbers: ClassVar[int]
+    places: ClassVar[NDArray[np.int64]]
+
+    @classmethod
+    def ground(cls, layout: Layout) -> NDArray[np.float32]:
+        """Return the numbers of a map without stars and hiker, ``(n_numbers,)``."""
+        numbers = np.full(cls.n_numbers, BLOCKED, dtype=np.float32)
+        numbers[cls.places[layout.is_path]] = PATHWAY
+        return numbers
+
+
+class PathwayEnv(MapView, PlanningEnv):
+    """A hiker on the pathways of a map; a subclass says what of it is seen."""
+
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array", "ansi"], "render_fps": 8}
+    variations: ClassVar[VariationSpace] = VARIATIONS
+    action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
+
+    def __init__(self, n_stars: int = 3, layout: str = "valley", render_mode: str | None = None) -> None:
+        super().__init__(render_mode)
+        self.variation = self.variations.update({}, {"n_stars": n_stars, "layout": layout})
+        self.observation_space = _OBSERVATION_SPACE
+        self.action_space = spaces.Discrete(len(ACTION_NAMES))
+        self._set_layout(_FIRST_LAYOUT)
+        self.hiker = self.layout.start
+        self.stars: set[int] = set()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Put the hiker onto the start and lay out the stars.
+
+        :param seed: seeds the generator that draws stars and random maps
+        :param options: new values of variation parameters; they stay in force
+        :return: observation ``(80,)`` and info
+        :raises ValueError: if a variation is not accepted; the variation in force is then unchanged
+        """
+        super().reset(seed=seed)
+        self.variation = self.variations.update(self.variation, options)
+        layout, stars = draw_task(self.np_random, self.variation)
+        self._set_layout(layout)
+        self.hiker, self.stars = layout.start, set(stars.tolist())
+        info = {
+            "is_success": False,
+            "variation": dict(self.variation),
+            "optimal_steps": planner.optimal_steps(layout, self.hiker, stars.tolist()),
+        }
+        self._show()
+        return self._observe(), info
+
+    def step(self, action: np.int64 | int) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Walk one cell, if it is a pathway.
+
+        :param action: 0 north, 1 east, 2 south, 3 west
+        :return: observation, reward, terminated, truncated, info
+        :raises ValueError: if the action is out of range
+        """
+        ahead = int(NEIGHBOURS[self.hiker, self._check_action(action)])
+        reward = STEP_REWARD
+        if ahead == self.hiker or not self.layout.is_path[ahead]:
+            reward += ILLEGAL_REWARD
+        else:
+            self.hiker = ahead
+        if self.hiker in self.stars:
+            self.stars.remove(self.hiker)
+            reward += STAR_REWARD
+        solved = not self.stars
+        self._show()
+        return self._observe(), reward, solved, False, {"is_success": solved}
+
+    def plan(self) -> list[int]:
+        """Return the actions of a shortest tour over the stars that are left, from the hiker's present place."""
+        return planner.plan(self.layout, self.hiker, sorted(self.stars))
+
+    def _set_layout(self, layout: Layout) -> None:
+        self.layout = layout
+        self._ground = self.ground(layout)
+
+    def _observe(self) -> NDArray[np.float32]:
+        numbers = self._ground.copy()
+        numbers[self.places[list(self.stars)]] = self.star_value
+        numbers[self.places[self.hiker]] = self.hiker_value
+        return self._seen(numbers)
+
+    @abstractmethod
+    def _seen(self, numbers: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the part of the map that is seen.
+
+        :param numbers: of the map with stars and hiker, ``(n_numbers,)``; an array of its own
+        """
+
+    def _frame(self) -> NDArray[np.uint8]:
+        return hiking_frame(
+            self.layout.rows, divmod(self.hiker, N_COLUMNS), self._star_cells(), self.variation["n_stars"]
+        )
+
+    def _star_cells(self) -> list[tuple[int, int]]:
+        return [divmod(star, N_COLUMNS) for star in sorted(self.stars)]
+
+    def _text(self) -> str:
+        rows = [list(row.replace("H", ".")) for row in self.layout.rows]
+        for row, column in self._star_cells():
+            rows[row][column] = "*"
+        rows[self.hiker // N_COLUMNS][self.hiker % N_COLUMNS] = "H"
+        return "\n".join("".join(row) for row in rows) + "\n"
+
+
+class PathwayVectorEnv(MapView, PlanningVectorEnv):
+    """N hikers stepped at once, equal to N :class:`PathwayEnv` step for step; a subclass says what is seen.
+
+    The numbers of all cells are kept up to date in one array, so that what is seen is a part of its rows.
+
+    :param num_envs: number of environments
+    :param n_stars: number of stars
+    :param layout: the map
+    :param max_episode_steps: steps after which an episode is truncated; ``None`` for no limit
+    """
+
+    variations: ClassVar[VariationSpace] = VARIATIONS
+    action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
+
+    def __init__(
+        self, num_envs: int = 1, n_stars: int = 3, layout: str = "valley", max_episode_steps: int | None = None
+    ) -> None:
+        variation = self.variations.update({}, {"n_stars": n_stars, "layout": layout})
+        super().__init__(num_envs, _OBSERVATION_SPACE, spaces.Discrete(len(ACTION_NAMES)), variation, max_episode_steps)
+        self._numbers = np.full((num_envs, self.n_numbers), BLOCKED, dtype=np.float32)
+        self._first_places = self._rows * self.n_numbers
+        self._hikers = np.zeros(num_envs, dtype=np.int64)
+        self._stars_left = np.zeros(num_envs, dtype=np.int64)
+        self._layouts: list[Layout] = [_FIRST_LAYOUT] * num_envs
+        self._stars: list[NDArray[np.int64]] = [np.zeros(0, dtype=np.int64)] * num_envs
+
+    def _reset_rows(self, rows: NDArray[np.intp]) -> None:
+        places = self.places
+        for row in rows:
+            layout, stars = draw_task(self._generators[row], self.row_variations[row])
+            numbers = self._numbers[row]
+            numbers[:] = self.ground(layout)
+            numbers[places[stars]] = self.star_value
+            numbers[places[layout.start]] = self.hiker_value
+            self._layouts[row], self._stars[row] = layout, stars
+            self._hikers[row], self._stars_left[row] = layout.start, len(stars)
+
+    def _move(self, actions: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        numbers, hikers, places = self._numbers.ravel(), self._hikers, self.places
+        ahead = NEIGHBOURS[hikers, actions]
+        number = numbers[self._first_places + places[ahead]]
+        legal = (ahead != hikers) & (number != BLOCKED)
+        found = legal & (number == self.star_value)
+        numbers[self._first_places + places[hikers]] = PATHWAY
+        self._hikers = np.where(legal, ahead, hikers)
+        numbers[self._first_places + places[self._hikers]] = self.hiker_value
+        self._stars_left -= found
+        rewards = np.where(legal, STEP_REWARD, STEP_REWARD + ILLEGAL_REWARD) + STAR_REWARD * found
+        return rewards, self._stars_left == 0
+
+    def _optimal_steps(self) -> NDArray[np.int64]:
+        steps = np.zeros(self.num_envs, dtype=np.int64)
+        n_stars = np.array([len(stars) for stars in self._stars])
+        for n in np.unique(n_stars):
+            rows = np.flatnonzero(n_stars == n)
+            distances = [
+                planner.tour_distances(self._layouts[row], self._layouts[row].start, self._stars[row].tolist())
+                for row in rows
+            ]
+            steps[rows] = planner.tour_lengths(np.stack(distances))
+        return steps

@@ -1,0 +1,45 @@
+"""``progpolicy envs``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sb3_progpolicy.cli.streams import quiet_stdout
+
+
+def envs() -> None:
+    """List the environments with their parameters, training variations and unseen variations."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from progpolicy_envs import DOMAINS
+
+    table = Table(show_lines=True)
+    for name in ("environment", "parameters", "trained on", "unseen"):
+        table.add_column(name, overflow="fold")
+    for domain in DOMAINS.values():
+        with quiet_stdout():
+            parameters = _parameters(domain.id)
+        table.add_row(
+            domain.id,
+            "\n".join(f"{name}: {parameter.allowed}" for name, parameter in parameters.items()),
+            _listed(domain.train),
+            _listed(domain.unseen),
+        )
+    Console().print(table)
+
+
+def _parameters(env_id: str) -> Mapping[str, Any]:
+    import gymnasium as gym
+    from gymnasium.envs.registration import load_env_creator
+
+    return getattr(load_env_creator(str(gym.spec(env_id).entry_point)), "variations", {})
+
+
+def _listed(variations: Any) -> str:
+    values: dict[str, dict[str, None]] = {}
+    for variation in variations:
+        for name, value in variation.items():
+            values.setdefault(name, {})[str(value)] = None
+    return "\n".join(f"{name}: {', '.join(seen)}" for name, seen in values.items())
