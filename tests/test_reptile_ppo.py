@@ -173,12 +173,19 @@ def test_policies_train_without_the_sampler(policy, cell, space):
     assert (weights(model) != before).any()
 
 
-def test_truncated_episodes_are_bootstrapped_and_ended_ones_are_not():
-    model = make(env=make_fast_vec_env("Pendulum-v1", 2), n_steps=256, batch_size=256, gamma=0.5, n_epochs=1)
+@pytest.mark.parametrize(
+    ("env", "bootstrapped"),
+    [
+        (lambda: make_fast_vec_env("Pendulum-v1", 2), [199]),  # cut off after 200 steps
+        (lambda: DummyVecEnv([OneStep] * 2), []),  # every step ends an episode
+    ],
+)
+def test_truncated_episodes_are_bootstrapped_and_ended_ones_are_not(env, bootstrapped):
+    model = make(env=env(), n_steps=256, batch_size=256, gamma=0.5, n_epochs=1)
     raw = []
     model.learn(512, callback=Each(lambda _, local: raw.append(local["rewards"].copy())))
     extra = model.rollout_buffer.rewards.reshape(256, 2) - np.array(raw)
-    assert np.flatnonzero(np.abs(extra).sum(1)).tolist() == [199]  # Pendulum is cut off after 200 steps
+    assert np.flatnonzero(np.abs(extra).sum(1)).tolist() == bootstrapped
 
 
 # The search for a program
@@ -219,6 +226,22 @@ def test_target_kl_ends_the_epochs_of_an_update():
     model.learn(64 * 3)
     # The first step starts at the policy of the rollout, the second would start away from it.
     assert n_steps == [64, 128, 192]
+
+
+def test_gradients_are_clipped_to_their_largest_norm():
+    model = make("MlpPolicy", max_grad_norm=0.0)
+    before = weights(model)
+    assert th.equal(weights(model.learn(64)), before)
+
+
+@pytest.mark.parametrize("normalize_advantage", [True, False])
+def test_advantages_are_normalised_if_asked_for(normalize_advantage):
+    kwargs = {"normalize_advantage": normalize_advantage, "learning_rate": 0.0, "batch_size": 64}
+    model = make("MlpPolicy", **kwargs).learn(64)
+    expected = 0 if normalize_advantage else -model.rollout_buffer.advantages.mean()
+    # The ratio is 1, so that the loss is the mean advantage, turned round.
+    assert model.logger.name_to_value["train/policy_gradient_loss"] == pytest.approx(expected, abs=1e-5)
+    assert abs(model.rollout_buffer.advantages.mean()) > 1e-3
 
 
 @pytest.mark.parametrize("clip_range_vf", [None, 1e-9])
