@@ -97,6 +97,7 @@ class _DotPrinter(ProgramVisitor[list[str]]):
 
 
 def _quote(*lines: str, end: str = "n") -> str:
-    escaped = (line.replace("\\", "\\\\").replace('"', '\\"') for line in lines)
+    # Graphviz reads a backslash as the start of an escape, such as that for the graph's name, and & as that of an entity.
+    escaped = (line.replace("&", "&amp;").replace("\\", "\\\\").replace('"', '\\"') for line in lines)
     joined = f"\\{end}".join(escaped)
     return f'"{joined}\\l"' if end == "l" else f'"{joined}"'

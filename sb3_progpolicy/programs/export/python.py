@@ -17,11 +17,9 @@ TERMS_PER_STATEMENT = 50  # Python's parser and compiler limit how long a sum ma
 # Python looks for a file's encoding in its first two lines. With this one first, no text of a program can set it.
 _CODING = "# -*- coding: utf-8 -*-"
 _MAX_IDENTIFIER = 40
-# Names that the written method uses itself.
-_TAKEN = frozenset(
-    "self observation previous_action previous_reward previous_done reward done action scores "
-    "tanh float int len max min map".split()
-)
+# Names that the written method uses itself, and Python's own.
+_TAKEN = {"self", "observation", "previous_action", "previous_reward", "previous_done", "reward", "done", "action"}
+_TAKEN |= {"scores", "tanh", "float", "int", "len", "max", "min", "map", *keyword.kwlist}
 # The local variables of the written method: one of these letters or words, then numbers.
 _OURS = re.compile(r"((new_)?[bhcrznifgoup]|scores|given|action)(_?[0-9])+")
 
@@ -278,7 +276,7 @@ class _Identifiers:
 
     def new(self, text: str) -> str:
         name = re.sub(r"[^0-9a-zA-Z]+", "_", text).strip("_").lower()[:_MAX_IDENTIFIER]
-        if not name or name[0].isdigit() or _OURS.fullmatch(name) or keyword.iskeyword(name) or name in _TAKEN:
+        if not name or name[0].isdigit() or name in _TAKEN or _OURS.fullmatch(name):
             name = f"x_{name}".rstrip("_")
         unique = name
         while unique in self.used:
