@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import imageio_ffmpeg
 import pytest
@@ -118,6 +119,22 @@ def test_show_draws(program, tmp_path, monkeypatch):
     assert run(["show", program, "--format", "png"]) == 0
     with Image.open("Hanoi-v0.png") as image:
         assert image.width > 300
+
+
+@pytest.mark.parametrize(
+    ("title", "written"),
+    [
+        ("..\\..\\x\0/y", "..-..-x-y.png"),
+        ("my_envs:Pong-v5", "Pong-v5.png"),
+        ("é" * 300, "-.png"),
+        ("a:", "program.png"),
+    ],
+)
+def test_picture_of_a_hostile_program_goes_to_a_plain_file_here(title, written, tmp_path, monkeypatch):
+    replace(hanoi_program(), metadata={"env": title}).save(tmp_path / "program.json")
+    monkeypatch.chdir(tmp_path)
+    assert run(["show", "program.json", "--format", "png"]) == 0
+    assert sorted(os.listdir()) == sorted([written, "program.json"])
 
 
 @pytest.mark.parametrize(

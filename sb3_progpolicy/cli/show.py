@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -36,12 +37,17 @@ def show(
             raise ValueError(f"{run_or_name} is not a program; ProgPolicy and PRLPolicy learn programs")
         content = _printed(source.program, format_)
     if output is None and isinstance(content, bytes):
-        output = Path(f"{(source.env_id or 'program').rpartition(':')[2].replace('/', '-')}.png")
+        output = Path(f"{_file_stem(source.env_id)}.png")
     if output is None:
         typer.echo(content, nl=False)
     else:
         write_atomically(output, content)
         typer.echo(f"Wrote {output}", err=True)
+
+
+def _file_stem(env_id: str | None) -> str:
+    """The id without its module; what not every file system takes, or takes for a folder, becomes a dash."""
+    return re.sub(r"[^A-Za-z0-9_.-]+", "-", (env_id or "").rpartition(":")[2])[:100] or "program"
 
 
 def _printed(program: Program, format_: str) -> str | bytes:

@@ -127,7 +127,7 @@ def _from_json(data: Any) -> ProgramData:
         raise ValueError(f'it does not say "format": "{FORMAT}"')
     if type(data.get("version")) is not int or data["version"] != VERSION:
         raise ValueError(
-            f"version {str(data.get('version'))[:20]} is not accepted, this release reads version {VERSION}; "
+            f"version {ascii(data.get('version'))[:20]} is not accepted, this release reads version {VERSION}; "
             "a newer file needs a newer sb3-progpolicy"
         )
     known = ("n_observations", "interaction", "input_names", "action", "output_names", "temperature")

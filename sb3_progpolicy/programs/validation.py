@@ -1,4 +1,4 @@
-"""The rules that make a program well formed, checked before it is run, printed, saved or believed from a file."""
+"""The rules for a well-formed program. They are checked before it is run, printed or saved, and after it is loaded."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ from typing import Any, get_args
 from sb3_progpolicy.programs.syntax import GATES, Condition, Controller, IfThenElse, ProgramData
 from sb3_progpolicy.spaces import ActionKind, ActionSpec
 
+# Far above real use (a screen of Atari is 7 056 inputs), and small enough that every printer takes seconds.
 MAX_CONDITIONS = 64
-MAX_NUMBERS = 100_000  # length of X and of a controller's output
-MAX_HIDDEN = 4096
+MAX_INPUTS = 32_768  # length of X
+MAX_OUTPUTS = 4_096  # of a controller
+MAX_NUMBERS = 250_000  # weights and constants of a whole program
 MAX_NAME_LENGTH = 200
 MAX_METADATA_DEPTH = 16
 
 
 def check_program(program: ProgramData) -> None:
-    """Check that sizes agree, numbers are finite and names are printable.
+    """Check that sizes agree and are not excessive, that numbers are finite and that names are printable.
 
     :param program: any program
     :raises ValueError: naming the first field at fault, what it holds and what is accepted
@@ -28,7 +30,7 @@ def check_program(program: ProgramData) -> None:
     _check_inputs(program)
     _check_names("output_names", program.output_names, program.action.n_outputs)
     if not _is_finite(program.temperature) or program.temperature <= 0:
-        raise ValueError(f"temperature={program.temperature!r} is not accepted; it is a finite number above 0")
+        raise ValueError(f"temperature={_short(program.temperature)} is not accepted; it is a finite number above 0")
     expression, index = program.body, 0
     while isinstance(expression, IfThenElse):
         if index == MAX_CONDITIONS:
@@ -37,6 +39,8 @@ def check_program(program: ProgramData) -> None:
         _check_controller(f"branches[{index}].then", expression.then, program)
         expression, index = expression.orelse, index + 1
     _check_controller("else", expression, program)
+    if (n_numbers := _count_numbers(program)) > MAX_NUMBERS:
+        raise ValueError(f"{n_numbers} weights and constants given; a program has at most {MAX_NUMBERS}")
     if not isinstance(program.metadata, Mapping):
         raise ValueError(f"metadata: {type(program.metadata).__name__} given; a mapping is accepted")
     _check_json("metadata", dict(program.metadata), MAX_METADATA_DEPTH)
@@ -46,16 +50,21 @@ def _check_action(action: ActionSpec) -> None:
     if not isinstance(action, ActionSpec):
         raise ValueError(f"action: {type(action).__name__} given; an ActionSpec is accepted")
     if action.kind not in get_args(ActionKind):
-        raise ValueError(f"action.kind={action.kind!r} is not accepted; it is one of {', '.join(get_args(ActionKind))}")
+        kinds = ", ".join(get_args(ActionKind))
+        raise ValueError(f"action.kind={_short(action.kind)} is not accepted; it is one of {kinds}")
     sizes = action.sizes
     if not isinstance(sizes, tuple) or not sizes or not all(_is_int(size) and size > 0 for size in sizes):
         raise ValueError(f"action.sizes={_short(sizes)} is not accepted; it is a tuple of whole numbers above 0")
     if action.kind != "multi_discrete" and len(sizes) != 1:
         raise ValueError(f"action.sizes={_short(sizes)} is not accepted; {action.kind!r} has one size")
-    if action.n_outputs > MAX_NUMBERS:
-        raise ValueError(f"action.sizes={_short(sizes)} is not accepted; they sum to at most {MAX_NUMBERS}")
-    if not _is_int(action.start) or (action.start != 0 and action.kind != "discrete"):
-        raise ValueError(f"action.start={action.start!r} is not accepted; a whole number, 0 unless kind is 'discrete'")
+    if action.n_outputs > MAX_OUTPUTS:
+        raise ValueError(f"action.sizes={_short(sizes)} is not accepted; they sum to at most {MAX_OUTPUTS}")
+    start = action.start
+    if not _is_int(start) or not _is_finite(start) or (start != 0 and action.kind != "discrete"):
+        raise ValueError(
+            f"action.start={_short(start)} is not accepted; "
+            "it is a whole number from -2**53 to 2**53, and 0 unless kind is 'discrete'"
+        )
     n_bounds = sizes[0] if action.kind == "box" else 0
     _check_vector("action.low", action.low, n_bounds)
     _check_vector("action.high", action.high, n_bounds)
@@ -64,22 +73,25 @@ def _check_action(action: ActionSpec) -> None:
 
 
 def _check_inputs(program: ProgramData) -> None:
-    if not _is_int(program.n_observations) or not 0 <= program.n_observations <= MAX_NUMBERS:
-        raise ValueError(f"n_observations={program.n_observations!r} is not accepted; 0 to {MAX_NUMBERS}")
+    if not _is_int(program.n_observations) or not 0 <= program.n_observations <= MAX_INPUTS:
+        raise ValueError(f"n_observations={_short(program.n_observations)} is not accepted; 0 to {MAX_INPUTS}")
     if not isinstance(program.interaction, bool):
-        raise ValueError(f"interaction={program.interaction!r} is not accepted; it is true or false")
+        raise ValueError(f"interaction={_short(program.interaction)} is not accepted; it is true or false")
     history = program.action.interaction_size if program.interaction else 0
-    _check_names("input_names", program.input_names, program.n_observations + history)
+    n_inputs = program.n_observations + history
+    if n_inputs > MAX_INPUTS:
+        raise ValueError(f"{n_inputs} inputs given, {history} for the history; at most {MAX_INPUTS} are accepted")
+    _check_names("input_names", program.input_names, n_inputs)
 
 
 def _check_condition(path: str, condition: Condition, n_inputs: int) -> None:
     if not isinstance(condition, Condition):
         raise ValueError(f"{path}: {type(condition).__name__} given; a Condition is accepted")
-    if condition.cell not in GATES:
-        raise ValueError(f"{path}.cell={condition.cell!r} is not accepted; it is one of {', '.join(GATES)}")
+    if condition.cell not in tuple(GATES):
+        raise ValueError(f"{path}.cell={_short(condition.cell)} is not accepted; it is one of {', '.join(GATES)}")
     n_hidden = condition.hidden_size
-    if condition.cell != "affine" and not 1 <= n_hidden <= MAX_HIDDEN:
-        raise ValueError(f"{path}.readout: {n_hidden} hidden units given; 1 to {MAX_HIDDEN} are accepted")
+    if condition.cell != "affine" and n_hidden == 0:
+        raise ValueError(f"{path}.readout: 0 hidden units given; a recurrent cell has at least 1")
     n_rows = n_hidden * len(GATES[condition.cell])
     _check_matrix(f"{path}.weight_ih", condition.weight_ih, n_rows, n_inputs)
     _check_matrix(f"{path}.weight_hh", condition.weight_hh, n_rows, n_hidden)
@@ -87,6 +99,14 @@ def _check_condition(path: str, condition: Condition, n_inputs: int) -> None:
     _check_vector(f"{path}.bias_hh", condition.bias_hh, n_rows)
     _check_vector(f"{path}.readout", condition.readout, n_hidden or n_inputs)
     _check_vector(f"{path}.readout_bias", (condition.readout_bias,), 1)
+
+
+def _count_numbers(program: ProgramData) -> int:
+    n_numbers = len(program.controllers) * program.action.n_outputs * (program.n_inputs + 1)
+    for condition in program.conditions:
+        n_columns = program.n_inputs + condition.hidden_size + 2
+        n_numbers += len(condition.bias_ih) * n_columns + len(condition.readout) + 1
+    return n_numbers
 
 
 def _check_controller(path: str, controller: Controller, program: ProgramData) -> None:

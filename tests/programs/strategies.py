@@ -89,6 +89,18 @@ programs = st.builds(
 )
 
 
+def small_program(rng: np.random.Generator) -> Program:
+    """A random program with up to two conditions."""
+    return build_program(
+        seed=int(rng.integers(2**32)),
+        cells=[CELLS[index] for index in rng.integers(len(CELLS), size=rng.integers(3))],
+        kind=KINDS[rng.integers(len(KINDS))],
+        interaction=bool(rng.integers(2)),
+        n_observations=int(rng.integers(1, 5)),
+        hidden_size=int(rng.integers(1, 3)),
+    )
+
+
 def hanoi_program(seed: int = 0, cell: Cell = "gru", hidden_size: int = 3, n_conditions: int = 2) -> Program:
     """A random program with the size and the names of one for Hanoi-v0."""
     rng = np.random.default_rng(seed)

@@ -206,11 +206,11 @@ def test_text_gives_every_number_of_a_condition_when_asked(cell):
 def test_every_program_prints_in_every_text_format(program):
     program = with_hostile_names(program)
     assert export_text(program).endswith("\n")
-    check_dot(export_graphviz(program), len(program.conditions))
-    check_latex(export_latex(program))
+    check_dot_grammar(export_graphviz(program), len(program.conditions))
+    check_latex_pairs(export_latex(program))
 
 
-def check_dot(source, n_conditions):
+def check_dot_grammar(source, n_conditions):
     """Tokens by the DOT grammar: a graph of node and edge statements, nothing left over."""
     token = re.compile(r'\s*("(?:[^"\\]|\\.)*"|->|[\w.]+|[\[\]{}=;,])')
     position, tokens = 0, []
@@ -230,7 +230,7 @@ def check_dot(source, n_conditions):
     assert len(re.findall(r"[BC]\d+ \[", body)) - 2 * n_conditions == 2 * n_conditions + 1
 
 
-def check_latex(source):
+def check_latex_pairs(source):
     plain = re.sub(r"\\\\", " ", source)
     plain = re.sub(r"\\[{}#$%&_]", "", plain)
     assert plain.count("{") == plain.count("}")

@@ -97,6 +97,7 @@ class _DotPrinter(ProgramVisitor[list[str]]):
 
 
 def _quote(*lines: str, end: str = "n") -> str:
-    escaped = (line.replace("\\", "\\\\").replace('"', '\\"') for line in lines)
+    # To Graphviz a backslash starts an escape, such as \G for the graph's name, and & an entity of HTML.
+    escaped = (line.replace("&", "&amp;").replace("\\", "\\\\").replace('"', '\\"') for line in lines)
     joined = f"\\{end}".join(escaped)
     return f'"{joined}\\l"' if end == "l" else f'"{joined}"'

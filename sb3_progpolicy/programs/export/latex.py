@@ -10,6 +10,7 @@ from sb3_progpolicy.programs.export.visitor import ProgramVisitor, deliver
 from sb3_progpolicy.programs.syntax import GATES, Condition, Controller, IfThenElse, Matrix, ProgramData
 from sb3_progpolicy.spaces import ActionSpec
 
+# All that TeX, or a package such as babel, may read as a command or as part of one.
 _ESCAPES = {
     "\\": r"\textbackslash{}",
     "~": r"\textasciitilde{}",
@@ -17,9 +18,13 @@ _ESCAPES = {
     "<": r"\textless{}",
     ">": r"\textgreater{}",
     "|": r"\textbar{}",
+    '"': r"\symbol{34}",
+    "`": r"\symbol{96}",
     **{character: f"\\{character}" for character in "#$%&_{}"},
 }
-# Gates are stacked in W, b, U and d from top to bottom in the order of the rows named here.
+# Letters beyond ASCII that LaTeX's standard fonts have. Any other character would be an error there.
+_LETTERS = frozenset(map(chr, range(0xC0, 0x100))) - frozenset("ÐÞðþ")
+# W, b, U and d hold the gates from top to bottom, in the order in which they are named here.
 _CELLS = {
     "rnn": (r"h_{%d} &\leftarrow \tanh(W x + b + U h_{%d} + d)",),
     "gru": (
@@ -41,7 +46,8 @@ def export_latex(
 ) -> str | None:
     r"""Typeset a program: the case distinction, the conditions' recurrences and all matrices, in the paper's notation.
 
-    The result is a fragment for a document that loads ``amsmath``. All weights are given, none is dropped.
+    The result is a fragment for a document that loads ``amsmath``. All weights are given, none is dropped. Names are
+    printed as they are; of the letters beyond ASCII, those from À to ÿ, and others as their code, such as ``\u2192``.
 
     :param program: what to typeset
     :param out_file: a path or an open text file to write to
@@ -132,4 +138,7 @@ def _rule(action: ActionSpec) -> str:
 
 
 def _escape(text: str) -> str:
-    return "".join(_ESCAPES.get(character, character) for character in text)
+    coded = (
+        character if character.isascii() or character in _LETTERS else ascii(character)[1:-1] for character in text
+    )
+    return "".join(_ESCAPES.get(character, character) for character in "".join(coded))

@@ -23,7 +23,7 @@ RAISES, LOWERS = "#12715b", "#b5411f"
 MINUS = "\N{MINUS SIGN}"
 # Inches of the natural size; monospaced text makes every width known before drawing.
 FONT_SIZE, CHARACTER, ROW, PAD, GAP = 9.0, 0.0753, 0.205, 0.14, 0.34
-MAX_ROWS = 12
+MAX_ROWS, MAX_NAME = 12, 40
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def plot_program(
     ax.set(xlim=(0, width), ylim=(0, height), aspect="equal")
     ax.axis("off")
     canvas = _Canvas(ax, scale)
-    canvas.text(GAP, height - GAP - 0.3 * ROW, title(program), INK, weight="bold", size=1.3)
+    canvas.text(GAP, height - GAP - 0.3 * ROW, _label(title(program)), INK, weight="bold", size=1.3)
     for number, line in enumerate(reading):
         canvas.text(GAP, height - GAP - ROW * (1.6 + number), line, QUIET, size=0.9)
     y = height - 1.5 * GAP - heading
@@ -134,7 +134,7 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
             constant, terms = self._terms(condition.readout_bias, condition.readout, units)
             heard = largest_terms(0.0, input_importance(condition), inputs, 9, self.max_terms)
             lines = [f"memory h: {counted(condition.hidden_size, f'{CELL_NAMES[condition.cell]} unit')}"]
-            lines += ["listens most to", *(f"  {_arrows(name)}" for _, name in heard.shown)] if heard.shown else []
+            lines += ["listens most to", *(f"  {_label(name)}" for _, name in heard.shown)] if heard.shown else []
         number = index + 1
         formula = [(f"B{number} = {constant}", INK, 0)]
         for text, colour in terms:
@@ -143,7 +143,7 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
         return _Card((head, tuple(formula), *(((line, QUIET, 0),) for line in lines)))
 
     def _leaf(self, controller: Controller) -> _Card:
-        names = [_arrows(name) for name in self.program.output_names]
+        names = [_label(name) for name in self.program.output_names]
         shown = min(len(names), self.max_outputs)
         sums = [
             self._terms(controller.bias[row], controller.weights[row], self.program.input_names) for row in range(shown)
@@ -166,7 +166,7 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
     ) -> tuple[str, list[tuple[str, str]]]:
         terms = largest_terms(constant, weights, names, self.decimals, self.max_terms)
         shown = [
-            (f"{_number(weight, self.decimals, '+')} {_arrows(name)}", RAISES if weight > 0 else LOWERS)
+            (f"{_number(weight, self.decimals, '+')} {_label(name)}", RAISES if weight > 0 else LOWERS)
             for weight, name in terms.shown
         ]
         return _number(constant, self.decimals), [*shown, *([("…", QUIET)] if terms.n_dropped else [])]
@@ -177,8 +177,9 @@ def _number(value: float, decimals: int, sign: str = "") -> str:
     return f"{shown:{sign}.{decimals}f}".replace("-", MINUS)
 
 
-def _arrows(name: str) -> str:
-    return name.replace("->", "→")
+def _label(name: str) -> str:
+    name = name.replace("->", "→")
+    return name if len(name) <= MAX_NAME else name[: MAX_NAME - 1] + "…"
 
 
 class _Canvas:
@@ -190,8 +191,8 @@ class _Canvas:
     def text(
         self, x: float, y: float, text: str, colour: str, weight: str = "normal", size: float = 1.0, **options: Any
     ) -> None:
-        # parse_math: names are data, a dollar sign in one is no formula.
-        options = {"va": "center", "family": "DejaVu Sans Mono", "parse_math": False, **options}
+        # Names are data: a dollar sign in one starts no formula, and TeX is never given one to run.
+        options = {"va": "center", "family": "DejaVu Sans Mono", "parse_math": False, "usetex": False, **options}
         self.ax.text(x, y, text, color=colour, weight=weight, size=FONT_SIZE * size * self.scale, **options)
 
     def card(self, card: _Card, x: float, middle: float, fill: str, edge: str, width: float | None = None) -> None:

@@ -13,21 +13,15 @@ from sb3_progpolicy.programs.export.visitor import CELL_NAMES, ProgramVisitor, c
 from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, ProgramData
 
 WIDTH = 110
-TERMS_PER_STATEMENT = 50  # Python's own parser and compiler limit how long a sum may be
+TERMS_PER_STATEMENT = 50  # Python's parser and compiler limit how long a sum may be
+# Python looks for a file's encoding in its first two lines. With this one first, no text of a program can set it.
+_CODING = "# -*- coding: utf-8 -*-"
 _MAX_IDENTIFIER = 40
-# Names that the written method uses itself.
-_TAKEN = {
-    "self",
-    "observation",
-    "previous_action",
-    "previous_reward",
-    "previous_done",
-    "reward",
-    "done",
-    "action",
-    "scores",
-}
-_TAKEN |= {"tanh", "float", "int", "len", "max", "min", "map"}
+# Names that the written method uses itself, and Python's own.
+_TAKEN = {"self", "observation", "previous_action", "previous_reward", "previous_done", "reward", "done", "action"}
+_TAKEN |= {"scores", "tanh", "float", "int", "len", "max", "min", "map", *keyword.kwlist}
+# The local variables of the written method: one of these letters or words, then numbers.
+_OURS = re.compile(r"((new_)?[bhcrznifgoup]|scores|given|action)(_?[0-9])+")
 
 
 def export_python(program: ProgramData, out_file: str | os.PathLike[str] | Any | None = None) -> str | None:
@@ -36,6 +30,9 @@ def export_python(program: ProgramData, out_file: str | os.PathLike[str] | Any |
     Its class ``ProgramPolicy`` has ``reset()`` and ``act(observation, previous_action, previous_reward,
     previous_done)`` and chooses the same actions as :class:`~sb3_progpolicy.programs.interpreter.ProgramRunner` with
     crisp semantics, to the last bit of every number: sums are taken in the same order.
+
+    The file is safe to run whoever made the program. The program's texts enter it as ASCII string literals and
+    comments with everything else escaped, and as variable names of letters, digits and underscores.
 
     :param program: what to write
     :param out_file: a path or an open text file to write to
@@ -47,7 +44,7 @@ def export_python(program: ProgramData, out_file: str | os.PathLike[str] | Any |
 
 @dataclass(frozen=True)
 class _Row:
-    """One sum ``name = constant + weights · X``; ``comment`` says what it is."""
+    """One sum ``name = constant + weights · X``."""
 
     name: str
     constant: float
@@ -90,7 +87,8 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
     def _head(self) -> list[str]:
         n = len(self.program.conditions)
         return [
-            f"# {title(self.program)}: {counted(n, 'condition')}, {counted(n + 1, 'controller')}.",
+            _CODING,
+            f"# {_commented(title(self.program))}: {counted(n, 'condition')}, {counted(n + 1, 'controller')}.",
             "# Written by sb3-progpolicy. Needs Python 3.8 or newer and nothing else.",
             "#",
             "#     policy = ProgramPolicy()",
@@ -156,7 +154,8 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
         ]
         if n:
             lines += _unpack(self.inputs, "map(float, observation)")
-        lines += [f"# {identifier}: {name}" for identifier, name in zip(self.inputs, program.input_names, strict=False)]
+        observed = program.input_names[:n]
+        lines += [f"# {variable}: {_commented(name)}" for variable, name in zip(self.inputs, observed, strict=True)]
         if not program.interaction:
             return lines
         if self.one_hot:
@@ -262,27 +261,27 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
         """A constant: for every previous action what it adds to each row, and zeros for none, found at index -1."""
         self.tables += ["", f"{name} = ("]
         for choice, column in enumerate(columns):
-            comment = f"# {self.program.input_names[first + choice]}"
+            comment = f"# {_commented(self.program.input_names[first + choice])}"
             self.tables += [f"    {comment}", *pack(_separated(map(_float, column)), "    (", "     ", WIDTH)]
             self.tables[-1] += "),"
         self.tables += ["    # no action yet", f"    (0.0,) * {len(columns[0])},", ")"]
 
 
 class _Identifiers:
-    """Readable and unique variable names made from any text."""
+    """Readable and unique variable names of ASCII letters, digits and underscores, made from any text."""
 
     def __init__(self) -> None:
         self.used: set[str] = set()
+        self.versions: dict[str, int] = {}  # the last version of each name that is used more than once
 
     def new(self, text: str) -> str:
         name = re.sub(r"[^0-9a-zA-Z]+", "_", text).strip("_").lower()[:_MAX_IDENTIFIER]
-        # Our own variables in the written file are one of these letters or words with numbers.
-        ours = re.fullmatch(r"((new_)?[bhcrznifgoup]|scores|given|action)(_?[0-9]+)+", name)
-        if not name or name[0].isdigit() or ours or keyword.iskeyword(name) or name in _TAKEN:
+        if not name or name[0].isdigit() or name in _TAKEN or _OURS.fullmatch(name):
             name = f"x_{name}".rstrip("_")
-        unique, count = name, 2
+        unique = name
         while unique in self.used:
-            unique, count = f"{name}_v{count}", count + 1
+            self.versions[name] = self.versions.get(name, 1) + 1
+            unique = f"{name}_v{self.versions[name]}"
         self.used.add(unique)
         return unique
 
@@ -363,8 +362,17 @@ def _list(start: str, items: Iterable[str]) -> list[str]:
 
 
 def _strings(name: str, values: Sequence[str]) -> list[str]:
-    return [f"{name} = (", *pack([f"{value!a}," for value in values], "        ", "        ", WIDTH), "    )"]
+    return [f"{name} = (", *pack([f"{_literal(value)}," for value in values], "        ", "        ", WIDTH), "    )"]
+
+
+def _literal(text: str) -> str:
+    return ascii(str(text))  # str, because NumPy's strings are written with their type
+
+
+def _commented(text: str) -> str:
+    return _literal(text)[1:-1]
 
 
 def _float(value: float) -> str:
-    return repr(float(value))
+    # The sum of two constants may be infinite, and "inf" would be a variable.
+    return repr(float(value)).replace("inf", "1e999")

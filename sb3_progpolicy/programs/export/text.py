@@ -45,6 +45,7 @@ class _TextPrinter(ProgramVisitor[list[str]]):
     def __init__(self, program: ProgramData, decimals: int, max_terms: int | None) -> None:
         super().__init__(program)
         self.decimals, self.max_terms = decimals, max_terms
+        self.inputs = [_set_apart(name) if _OPERATORS & set(name) else name for name in program.input_names]
 
     def print(self) -> str:
         lines = [*self._heading(), "", *self.visit(self.program.body)]
@@ -83,29 +84,29 @@ class _TextPrinter(ProgramVisitor[list[str]]):
         ]
 
     def _lines(self, controller: Controller) -> list[str]:
-        names = self.program.output_names
+        names = [_set_apart(name) if "=" in name else name for name in self.program.output_names]
         width = max(len(name) for name in names)
         lines = []
         for name, constant, weights in zip(names, controller.bias, controller.weights, strict=True):
             start = f"{INDENT}{name.ljust(width)} = "
-            lines += self._sum(start, constant, weights, self.program.input_names)
+            lines += self._sum(start, constant, weights, self.inputs)
         return lines
 
     def _condition(self, condition: Condition, index: int) -> list[str]:
-        inputs, size = self.program.input_names, condition.hidden_size
+        size = condition.hidden_size
         start = f"B{index + 1} = "
         if condition.cell == "affine":
-            return self._sum(start, condition.readout_bias, condition.readout, inputs)
+            return self._sum(start, condition.readout_bias, condition.readout, self.inputs)
         units = [f"h{unit + 1}" for unit in range(size)]
         lines = self._sum(start, condition.readout_bias, condition.readout, units)
         lines.append(f"{INDENT}its memory: {counted(size, f'{CELL_NAMES[condition.cell]} unit')}")
-        rows = list(zip(gate_names(condition), self._gates(condition, [*inputs, *units]), strict=True))
+        rows = list(zip(gate_names(condition), self._gates(condition, units), strict=True))
         for unit in range(size):
             lines += [line for (_, owner), gate in rows if owner == unit for line in gate]
         return lines
 
-    def _gates(self, condition: Condition, names: Sequence[str]) -> list[list[str]]:
-        gates = []
+    def _gates(self, condition: Condition, units: Sequence[str]) -> list[list[str]]:
+        gates, names = [], [*self.inputs, *units]
         for row, (gate, unit) in enumerate(gate_names(condition)):
             squash = "tanh" if gate in ("h", "n", "g") else "sigmoid"
             recurrent, constant = condition.weight_hh[row], condition.bias_ih[row] + condition.bias_hh[row]
@@ -116,11 +117,10 @@ class _TextPrinter(ProgramVisitor[list[str]]):
                 )
                 continue
             # r scales the recurrent part of n alone, so that part is a sum of its own.
-            inner = " ".join(self._tokens(condition.bias_hh[row], recurrent, names[self.program.n_inputs :]))
+            inner = " ".join(self._tokens(condition.bias_hh[row], recurrent, units))
             close = ")" if inner in ("0", "-0") else f" + r{unit + 1}*({inner}))"
-            inputs = names[: self.program.n_inputs]
             gates.append(
-                self._sum(f"{label}{squash}(", condition.bias_ih[row], condition.weight_ih[row], inputs, close)
+                self._sum(f"{label}{squash}(", condition.bias_ih[row], condition.weight_ih[row], self.inputs, close)
             )
         return gates
 
@@ -129,15 +129,24 @@ class _TextPrinter(ProgramVisitor[list[str]]):
     ) -> list[str]:
         tokens = self._tokens(constant, weights, names)
         tokens[-1] += close
-        return pack(tokens, start, " " * len(start), WIDTH)
+        return pack(tokens, start, " " * min(len(start), WIDTH // 2), WIDTH)
 
     def _tokens(self, constant: float, weights: Sequence[float], names: Sequence[str]) -> list[str]:
         terms = largest_terms(constant, weights, names, self.decimals, self.max_terms)
         tokens = [f"{constant:.{self.decimals}f}"] if round(constant, self.decimals) else []
         for weight, name in terms.shown:
             sign = "-" if weight < 0 else "+" if tokens else ""
-            shown = f"[{name}]" if _OPERATORS & set(name) else name
-            tokens.append(f"{sign}{' ' if tokens else ''}{abs(weight):.{self.decimals}f}*{shown}")
+            tokens.append(f"{sign}{' ' if tokens else ''}{abs(weight):.{self.decimals}f}*{name}")
         if terms.n_dropped:
             tokens.append(f"{'+ ' if tokens else ''}({counted(terms.n_dropped, 'smaller term')})")
         return tokens or ["0"]
+
+
+def _set_apart(name: str) -> str:
+    """Put a name into brackets, or into quotes where its own brackets could end them early."""
+    depth = 0
+    for character in name:
+        depth += (character == "[") - (character == "]")
+        if depth < 0:
+            return repr(name)
+    return repr(name) if depth else f"[{name}]"
