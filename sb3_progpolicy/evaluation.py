@@ -12,9 +12,10 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from progpolicy_envs import DOMAINS
+from sb3_progpolicy.extraction import wrappers_of
 from sb3_progpolicy.interaction import VecInteractionHistory
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.programs.interpreter import ProgramRunner, Semantics, join_inputs
@@ -88,6 +89,8 @@ def evaluate_program(
     if not env_id:
         raise ValueError("the program does not say which environment it is for; give env_id")
 
+    _refuse_wrappers("the program", program.metadata.get("wrappers", ()))
+
     def start(venv: VecEnv) -> Act:
         spec, n_observations = action_spec(venv.action_space), int(np.prod(venv.observation_space.shape or ()))
         if (spec, n_observations) != (program.action, program.n_observations):
@@ -128,8 +131,14 @@ def evaluate_model(
     """
     keeps_state = bool(getattr(model, "interaction_history", False))
 
+    env = model.get_env()
+    _refuse_wrappers("the model", getattr(model, "wrappers", ()) if env is None else wrappers_of(env))
+    normalizer = model.get_vec_normalize_env()
+
     def prepare(venv: VecEnv) -> VecEnv:
         assert model.observation_space is not None
+        if normalizer is not None:
+            venv = _normalized(venv, normalizer)
         if venv.observation_space.shape == model.observation_space.shape:
             return venv
         joined = interaction_space(venv.observation_space, action_spec(venv.action_space))
@@ -152,6 +161,32 @@ def evaluate_model(
         return act
 
     return _evaluate(env_id, variations, n_episodes, None, seed, max_steps, env_kwargs, prepare, start)
+
+
+def _refuse_wrappers(what: str, wrappers: Sequence[str]) -> None:
+    if wrappers:
+        raise ValueError(
+            f"{what} was trained in an environment wrapped in {', '.join(wrappers)}, which an id alone does not bring "
+            "back. Evaluate it in that environment, as with SB3's evaluate_policy(model, model.get_env())"
+        )
+
+
+def _normalized(venv: VecEnv, normalizer: VecNormalize) -> VecNormalize:
+    """Normalise as a model's environment did when its training ended."""
+    copy = VecNormalize(
+        venv,
+        training=False,
+        norm_obs=normalizer.norm_obs,
+        norm_reward=normalizer.norm_reward,
+        clip_obs=normalizer.clip_obs,
+        clip_reward=normalizer.clip_reward,
+        epsilon=normalizer.epsilon,
+        norm_obs_keys=normalizer.norm_obs_keys,
+    )
+    copy.ret_rms = normalizer.ret_rms
+    if normalizer.norm_obs:
+        copy.obs_rms = normalizer.obs_rms
+    return copy
 
 
 def _evaluate(

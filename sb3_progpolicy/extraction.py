@@ -4,12 +4,27 @@ from __future__ import annotations
 
 from typing import Any
 
+import gymnasium as gym
+import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
+from stable_baselines3.common.vec_env import (
+    VecCheckNan,
+    VecEnv,
+    VecEnvWrapper,
+    VecMonitor,
+    VecNormalize,
+    VecVideoRecorder,
+)
 
-from sb3_progpolicy.interaction import VecInteractionHistory, program_names
+from sb3_progpolicy.interaction import VecInteractionHistory, appends_history, program_names
 from sb3_progpolicy.policies import ProgrammaticActorCritic
 from sb3_progpolicy.programs.program import Program
+from sb3_progpolicy.programs.transform import fold_normalization
+
+# Wrappers of which a program knows what they do, or that do nothing to what it sees.
+_KNOWN = (VecMonitor, VecInteractionHistory, VecNormalize, VecCheckNan, VecVideoRecorder)
+_HARMLESS = {"Monitor", "RecordEpisodeStatistics", "RecordVideo", "HumanRendering", "RenderCollection", "TimeLimit"}
+_HARMLESS |= {"OrderEnforcing", "PassiveEnvChecker", "InteractionHistory", "RemakeOnVariation"}
 
 
 def holds_program(model: BaseAlgorithm) -> bool:
@@ -20,9 +35,13 @@ def holds_program(model: BaseAlgorithm) -> bool:
 def extract_program(model: BaseAlgorithm, **metadata: Any) -> Program:
     """Return the most likely program of a model as plain data, its inputs and outputs named by the environment.
 
+    It reads what the environment gives. What ``VecNormalize`` does to observations is folded into it, which is exact as
+    long as ``clip_obs`` is not reached. Other wrappers are named in ``metadata["wrappers"]``.
+
     :param model: of any algorithm, with the policy ``ProgPolicy`` or ``PRLPolicy``
     :param metadata: JSON values to keep with it; environment id, seed and number of steps are put in
     :raises TypeError: if the policy is not a program
+    :raises ValueError: if the policy reads rewards that ``VecNormalize`` has scaled
     """
     policy, env = model.policy, model.get_env()
     if not isinstance(policy, ProgrammaticActorCritic):
@@ -30,12 +49,50 @@ def extract_program(model: BaseAlgorithm, **metadata: Any) -> Program:
     # ReptilePPO knows these without its environment too.
     inputs, outputs = getattr(model, "input_names", None), getattr(model, "output_names", None)
     env_id, interaction = getattr(model, "env_id", None), getattr(model, "interaction_history", False)
+    wrappers = getattr(model, "wrappers", ())
     if env is not None:
         inputs, outputs = (inputs, outputs) if inputs else program_names(env)
-        env_id, interaction = env_id or env_id_of(env), is_vecenv_wrapped(env, VecInteractionHistory)
+        env_id, interaction, wrappers = env_id or env_id_of(env), appends_history(env), wrappers_of(env)
     origin = {"env": env_id, "seed": model.seed, "timesteps": model.num_timesteps}
+    if wrappers:
+        origin["wrappers"] = list(wrappers)
     # A saved model's tuples are loaded as lists.
-    return policy.program(tuple(inputs or ()), tuple(outputs or ()), interaction, **{**origin, **metadata})
+    program = policy.program(tuple(inputs or ()), tuple(outputs or ()), interaction, **{**origin, **metadata})
+    normalizer = model.get_vec_normalize_env()
+    return program if normalizer is None else _fold(program, normalizer)
+
+
+def _fold(program: Program, normalizer: VecNormalize) -> Program:
+    if program.interaction and normalizer.norm_reward:
+        raise ValueError(
+            "a program that reads its previous reward cannot be trained on rewards that VecNormalize scales: run alone "
+            "it would read others. Give VecNormalize norm_reward=False; ReptilePPO has scale_rewards=True"
+        )
+    mean, scale = np.zeros(program.n_inputs), np.ones(program.n_inputs)
+    if normalizer.norm_obs:
+        statistics: Any = normalizer.obs_rms
+        n_observations = len(statistics.mean)
+        mean[:n_observations] = statistics.mean
+        scale[:n_observations] = 1 / np.sqrt(statistics.var + normalizer.epsilon)
+    return fold_normalization(program, mean, scale)
+
+
+def wrappers_of(env: VecEnv) -> tuple[str, ...]:
+    """Return the names of the wrappers that change what a policy sees, and that an id alone does not bring back.
+
+    :param env: the environments of a model; ``VecNormalize`` is not named, its statistics are known
+    """
+    names = []
+    while isinstance(env, VecEnvWrapper):
+        if not isinstance(env, _KNOWN):
+            names.append(type(env).__name__)
+        env = env.venv
+    spec = env.get_attr("spec")[0] if env.has_attr("spec") else None
+    if spec is not None:
+        registered = gym.registry[spec.id].additional_wrappers if spec.id in gym.registry else ()
+        expected = _HARMLESS | {wrapper.name for wrapper in registered}
+        names += [wrapper.name for wrapper in spec.additional_wrappers if wrapper.name not in expected]
+    return tuple(names)
 
 
 def env_id_of(env: Any) -> str | None:

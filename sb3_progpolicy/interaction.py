@@ -105,6 +105,11 @@ class VecInteractionHistory(VecEnvWrapper):
         return joined, rewards, dones, infos
 
 
+def appends_history(venv: VecEnv) -> bool:
+    """Return whether observations end with the interaction history, whichever wrapper appends it."""
+    return is_vecenv_wrapped(venv, VecInteractionHistory) or any(venv.env_is_wrapped(InteractionHistory))
+
+
 def program_names(venv: VecEnv) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return readable names of a program's inputs and outputs.
 
@@ -114,7 +119,7 @@ def program_names(venv: VecEnv) -> tuple[tuple[str, ...], tuple[str, ...]]:
     :return: one name per number of X, one per controller output
     """
     spec = action_spec(venv.action_space)
-    history = spec.interaction_size if is_vecenv_wrapped(venv, VecInteractionHistory) else 0
+    history = spec.interaction_size if appends_history(venv) else 0
     n_observations = int(np.prod(venv.observation_space.shape or (0,))) - history
     observations, actions = (_names(venv, attribute) for attribute in ("observation_names", "action_names"))
     if len(observations) != n_observations:

@@ -13,7 +13,7 @@ from sb3_progpolicy.programs import ProgramRunner
 MODEL = Path(__file__).parent / "data" / "reptile_ppo_0_1.zip"  # 128 steps on Hanoi, Adam as the meta-optimizer
 
 
-@pytest.mark.filterwarnings("ignore:sb3_progpolicy.reptile.tasks")
+@pytest.mark.filterwarnings("ignore:sb3_progpolicy.tasks")
 def test_model_of_release_0_1_is_loaded_and_trains_on():
     model = ReptilePPO.load(MODEL, env="Hanoi-v0")
     assert (model.meta_iteration, model.num_timesteps) == (2, 128)
@@ -38,7 +38,7 @@ def test_names_of_release_0_1_still_work_and_say_what_they_are_called_now():
         env.forget()
     assert not env.observation(np.zeros(4))[4:].any()
     with pytest.warns(DeprecationWarning, match=r"sb3_progpolicy\.reptile\.tasks"):
-        from sb3_progpolicy.reptile.tasks import UniformSampler
+        from sb3_progpolicy.tasks import UniformSampler
     assert UniformSampler.__module__ == "sb3_progpolicy.reptile.tasks"
     from sb3_progpolicy.programs.syntax import Program
 

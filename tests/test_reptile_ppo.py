@@ -9,7 +9,6 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_progpolicy import InteractionHistory, ReptilePPO, VecInteractionHistory
@@ -144,10 +143,6 @@ def test_rollout_of_the_sampler_is_that_of_the_policy_stepped_by_hand(cell):
     th.testing.assert_close(model._last_lstm_states.pi[0], state[0].detach(), atol=1e-5, rtol=1e-5)
 
 
-class OwnExtractor(FlattenExtractor):
-    """Not one the sampler knows, so that the policy itself acts in rollouts, as it does on a GPU."""
-
-
 @pytest.mark.parametrize(
     ("policy", "cell", "space"),
     [
@@ -159,9 +154,10 @@ class OwnExtractor(FlattenExtractor):
     ],
 )
 def test_policies_train_without_the_sampler(policy, cell, space):
-    policy_kwargs = {"cell": cell, "features_extractor_class": OwnExtractor}
     env = DummyVecEnv([lambda: OneStep(space)] * 4)
-    model = make(policy, env, n_epochs=1, search_fraction=1.0, policy_kwargs=policy_kwargs)
+    model = make(policy, env, n_epochs=1, search_fraction=1.0, policy_kwargs={"cell": cell})
+    # As on a GPU, where the policy itself acts in rollouts.
+    model.adapter.make_actor = lambda states, buffer, n_steps, rng: PolicyActor(model.policy, states, buffer)
     # Rollouts for an update of phi and one of W, each from parameters that have not moved since.
     for ratio, values in log_ratios(model):
         assert ratio.abs().max() < 1e-5

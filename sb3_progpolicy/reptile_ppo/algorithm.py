@@ -17,7 +17,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
 from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_progpolicy.extraction import env_id_of, extract_program
+from sb3_progpolicy.extraction import env_id_of, extract_program, wrappers_of
 from sb3_progpolicy.interaction import program_names
 from sb3_progpolicy.normalization import NormalizingExtractor
 from sb3_progpolicy.policies import ProgrammaticActorCritic, ProgrammaticPolicy, RecurrentProgrammaticPolicy
@@ -181,8 +181,10 @@ class ReptilePPO(SequencePPO):
         self.normalize_observations = normalize_observations
         self.input_names: tuple[str, ...] | None = None
         self.output_names: tuple[str, ...] | None = None
+        self.wrappers: tuple[str, ...] = ()
         if venv is not None:
             self.input_names, self.output_names = program_names(venv)
+            self.wrappers = wrappers_of(venv)
         self.meta_iteration = 0
         super().__init__(
             policy,
