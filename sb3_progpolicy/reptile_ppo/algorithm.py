@@ -383,7 +383,7 @@ class ReptilePPO(SequencePPO):
         """
         if print_system_info:
             get_system_info()
-        return load_model(cls, path, env, device, custom_objects or {}, force_reset, allow_pickle, kwargs)  # type: ignore[no-any-return]
+        return load_model(cls, path, env, device, custom_objects or {}, force_reset, allow_pickle, kwargs)
 
     def set_env(self, env: GymEnv | str, force_reset: bool = True) -> None:
         """Set the environment, and append the interaction history to its observations if the policy reads it.
