@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from sb3_progpolicy.policies import ProgrammaticPolicy, RecurrentProgrammaticPolicy
     from sb3_progpolicy.pretrained import load_pretrained, pretrained_names
     from sb3_progpolicy.reptile.callback import ReptileWrapper
-    from sb3_progpolicy.reptile.checkpoint import ReptileCheckpoint
+    from sb3_progpolicy.reptile.checkpoint import ReptileCheckpoint, load_last_good
     from sb3_progpolicy.reptile.tasks import RemakeOnVariation, TaskDistribution
     from sb3_progpolicy.reptile_ppo import ReptilePPO
     from sb3_progpolicy.vec_env import BatchedVecEnv, make_fast_vec_env
@@ -37,6 +37,7 @@ _MODULES = {
     "evaluate_program": "evaluation",
     "extract_program": "extraction",
     "holds_program": "extraction",
+    "load_last_good": "reptile",
     "load_pretrained": "pretrained",
     "make_fast_vec_env": "vec_env",
     "pretrained_names": "pretrained",
@@ -60,6 +61,7 @@ __all__ = [
     "evaluate_program",
     "extract_program",
     "holds_program",
+    "load_last_good",
     "load_pretrained",
     "make_fast_vec_env",
     "pretrained_names",

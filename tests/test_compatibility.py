@@ -15,7 +15,9 @@ MODEL = Path(__file__).parent / "data" / "reptile_ppo_0_1.zip"  # 128 steps on H
 
 @pytest.mark.filterwarnings("ignore:sb3_progpolicy.tasks")
 def test_model_of_release_0_1_is_loaded_and_trains_on():
-    model = ReptilePPO.load(MODEL, env="Hanoi-v0")
+    with pytest.raises(ValueError, match="allow_pickle=True"):
+        ReptilePPO.load(MODEL, env="Hanoi-v0")
+    model = ReptilePPO.load(MODEL, env="Hanoi-v0", allow_pickle=True)
     assert (model.meta_iteration, model.num_timesteps) == (2, 128)
     assert [variation["n_discs"] for variation in model.tasks.variations] == [1, 2]
     momentum = model.outer_optimizer.state_dict()["state"][0]["exp_avg"]

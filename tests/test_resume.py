@@ -9,7 +9,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_progpolicy import ReptileCheckpoint, ReptilePPO, TaskDistribution
+from sb3_progpolicy import ReptileCheckpoint, ReptilePPO, TaskDistribution, load_last_good
 
 TIMESTEPS = 8 * 32 * 2 * 8
 
@@ -141,7 +141,7 @@ def test_save_that_fails_leaves_the_old_file_and_no_other(writer, tmp_path, monk
     path = tmp_path / "model.zip"
     checkpoint = ReptileCheckpoint(path)
     model = ReptilePPO("ProgPolicy", "Hanoi-v0", n_envs=2, n_steps=16, inner_updates=1).learn(64, checkpoint)
-    before = path.read_bytes()
+    before, files = path.read_bytes(), sorted(os.listdir(tmp_path))
 
     def fail(*_):
         raise OSError("disk full")
@@ -151,7 +151,26 @@ def test_save_that_fails_leaves_the_old_file_and_no_other(writer, tmp_path, monk
     with pytest.raises(OSError, match="disk full"):
         save()
     assert path.read_bytes() == before
-    assert os.listdir(tmp_path) == [path.name]
+    assert sorted(os.listdir(tmp_path)) == files
+
+
+@pytest.mark.parametrize("damage", ["truncated", "changed", "missing"])
+def test_damaged_checkpoint_is_replaced_by_the_one_before_which_is_said(damage, tmp_path):
+    path = tmp_path / "model.zip"
+    model = ReptilePPO("ProgPolicy", "Hanoi-v0", n_envs=2, n_steps=16, inner_updates=1, seed=0)
+    model.learn(32 * 4, ReptileCheckpoint(path))  # at the boundaries 0, 32, 64 and 96
+    assert load_last_good(path, ReptilePPO.load).num_timesteps == 96
+    content = path.read_bytes()
+    changed = content[:2000] + bytes([content[2000] ^ 1]) + content[2001:]
+    path.unlink()
+    if damage != "missing":
+        path.write_bytes(content[:-100] if damage == "truncated" else changed)
+    with pytest.warns(UserWarning, match=r"going on from .*model\.previous\.zip, step 64"):
+        resumed = load_last_good(path, ReptilePPO.load, env="Hanoi-v0")
+    resumed.learn(32, ReptileCheckpoint(path), reset_num_timesteps=False)
+    # The checkpoint written anew has not pushed the good one out for the damaged one.
+    assert ReptilePPO.load(tmp_path / "model.previous.zip").num_timesteps == 64
+    assert ReptilePPO.load(path).num_timesteps == 64
 
 
 def test_checkpoint_without_a_boundary_writes_nothing(tmp_path):

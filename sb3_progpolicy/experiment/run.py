@@ -22,7 +22,7 @@ from sb3_progpolicy.extraction import extract_program, holds_program
 from sb3_progpolicy.interaction import VecInteractionHistory
 from sb3_progpolicy.programs.files import write_atomically
 from sb3_progpolicy.reptile.callback import ReptileWrapper
-from sb3_progpolicy.reptile.checkpoint import ReptileCheckpoint
+from sb3_progpolicy.reptile.checkpoint import ReptileCheckpoint, load_last_good
 from sb3_progpolicy.reptile.tasks import TaskDistribution, default_tasks
 from sb3_progpolicy.reptile_ppo.environments import DEFAULT_N_ENVS
 from sb3_progpolicy.vec_env import make_fast_vec_env
@@ -165,7 +165,7 @@ def resume(folder: Path, n_timesteps: int | None = None, verbose: int = 0) -> tu
         config = replace(config, hyperparams={**config.hyperparams, "n_timesteps": n_timesteps})
     if not (folder / MODEL).is_file():
         raise ValueError(f"{folder} has no checkpoint yet; start the training anew")
-    model = load_model(folder / MODEL, env=make_env(config), device=config.device)
+    model = load_last_good(folder / MODEL, load_model, env=make_env(config), device=config.device)
     model.verbose = verbose
     return model, config
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
@@ -13,9 +13,8 @@ import torch as th
 from sb3_contrib.ppo_recurrent import MlpLstmPolicy
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
-from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
-from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.common.utils import FloatSchedule, get_system_info
 
 from sb3_progpolicy.extraction import env_id_of, extract_program, wrappers_of
 from sb3_progpolicy.interaction import program_names
@@ -27,6 +26,8 @@ from sb3_progpolicy.reptile.statistics import EpisodeStatistics
 from sb3_progpolicy.reptile.steps import MetaOptimizer, MetaOptimizerName, Task, begin_task
 from sb3_progpolicy.reptile.tasks import TaskDistribution, default_tasks
 from sb3_progpolicy.reptile_ppo.environments import make_venv, with_history
+from sb3_progpolicy.reptile_ppo.loading import load_model, parameters_of
+from sb3_progpolicy.reptile_ppo.saving import write_model
 from sb3_progpolicy.reptile_ppo.sequence_ppo import SequencePPO
 from sb3_progpolicy.reptile_ppo.theta import Theta
 
@@ -160,6 +161,7 @@ class ReptilePPO(SequencePPO):
         check_reptile_arguments(inner_updates, tasks_per_iteration)
         self.env_id = env if isinstance(env, str) else env_id_of(env)
         self.interaction_history = interaction_history
+        self.env_kwargs = dict(env_kwargs or {})
         venv = None
         if env is not None:
             venv = with_history(make_venv(env, n_envs, seed, env_kwargs or {}), interaction_history)
@@ -340,6 +342,24 @@ class ReptilePPO(SequencePPO):
 
     # ------------------------------------------------------------------------------------------- save and load
 
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+        *,
+        allow_pickle: bool = False,
+    ) -> None:
+        """Save the model as data: a zip of JSON and safetensors. A file is replaced only when the new one is complete.
+
+        :param path: of the file, or a stream
+        :param exclude: fields to leave out: names of constructor arguments
+        :param include: fields not to leave out, though they are in ``exclude``
+        :param allow_pickle: pickle what is not data, such as a function; :meth:`load` then asks for the same
+        :raises ValueError: if something is not data, or a parameter is not finite
+        """
+        write_model(self, path, exclude, include, allow_pickle)
+
     @classmethod
     def load(
         cls: type[SelfReptilePPO],
@@ -349,38 +369,39 @@ class ReptilePPO(SequencePPO):
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
         force_reset: bool = True,
+        *,
+        allow_pickle: bool = False,
         **kwargs: Any,
     ) -> SelfReptilePPO:
-        """Load a model. See SB3's ``BaseAlgorithm.load``.
+        """Load a model, from data alone. See SB3's ``BaseAlgorithm.load`` for what is not said here.
 
-        :param env: an environment id is accepted too; what the policy sees of its interaction is appended as it was
-            in training
+        :param path: of the file, or a stream
+        :param env: an environment id is accepted too; ``n_envs`` and ``env_kwargs`` are the saved ones unless given
+        :param custom_objects: fields to take instead of the file's
+        :param allow_pickle: load a file that you trust although it holds pickles, which runs the code in them: one
+            saved with ``allow_pickle=True``, or by release 0.1
+        :param kwargs: arguments of the constructor to change
+        :raises ValueError: if the file is damaged, holds pickles, or something cannot be changed
         """
-        if env is not None:
-            data, _, _ = load_from_zip_file(path, device=device, custom_objects=custom_objects)
-            if isinstance(path, io.BufferedIOBase):
-                path.seek(0)
-            assert data is not None
-            n_envs = data["n_envs"] if isinstance(env, str) else None
-            env = with_history(make_venv(env, n_envs, data["seed"], {}), data["interaction_history"])
-        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        if print_system_info:
+            get_system_info()
+        return load_model(cls, path, env, device, custom_objects or {}, force_reset, allow_pickle, kwargs)
 
-    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """Set the environment, and append the interaction history to its observations if the policy reads it."""
-        super().set_env(with_history(make_venv(env, None, None, {}), self.interaction_history), force_reset)
+    def set_env(self, env: GymEnv | str, force_reset: bool = True) -> None:
+        """Set the environment, and append the interaction history to its observations if the policy reads it.
+
+        :param env: an environment id is accepted too; it is made with the ``env_kwargs`` of this one
+        :param force_reset: see SB3's ``BaseAlgorithm.set_env``
+        """
+        made = isinstance(env, str)
+        venv = make_venv(env, self.n_envs if made else None, self.seed, self.env_kwargs if made else {})
+        super().set_env(with_history(venv, self.interaction_history), force_reset)
 
     def set_parameters(
         self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
         """Load parameters. See SB3's ``BaseAlgorithm.set_parameters``."""
-        if isinstance(load_path_or_dict, dict) and "reptile.meta_optimizer" in load_path_or_dict:  # of release 0.1
-            renamed: Any = dict(load_path_or_dict)
-            renamed["outer_optimizer"] = renamed.pop("reptile.meta_optimizer")
-            load_path_or_dict = renamed
-        super().set_parameters(load_path_or_dict, exact_match, device)
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "outer_optimizer", "_task", "_statistics"]
+        super().set_parameters(parameters_of(self, load_path_or_dict), exact_match, device)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer", "outer_optimizer"], []

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import math
-import os
-import pathlib
-import uuid
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -82,9 +78,6 @@ class SequencePPO(PPO):
         if self.action_std is not None and not hasattr(self.policy, "log_std"):
             raise ValueError(f"action_std is for Box actions, not {self.action_space}")
         self._last_lstm_states = self.adapter.initial_states(self.n_envs)
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "adapter", "rng", "_actor", "_last_lstm_states"]
 
     @property
     def recurrent(self) -> bool:
@@ -278,7 +271,7 @@ class SequencePPO(PPO):
         self.logger.record("train/clip_range", clip_range)
         self.adapter.log(self.logger, self._actor)
 
-    # ---------------------------------------------------------------------------------------- predict and save
+    # ------------------------------------------------------------------------------------------------- predict
 
     def predict(
         self,
@@ -316,23 +309,3 @@ class SequencePPO(PPO):
                 f"of which {history} are the previous action, reward and done flag. Take observations from "
                 "model.get_env(), or from the environment wrapped in sb3_progpolicy.InteractionHistory"
             )
-
-    def save(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
-    ) -> None:
-        """Save the model; a file of the same name is replaced only when the new one is complete."""
-        if isinstance(path, io.BufferedIOBase):
-            super().save(path, exclude, include)
-            return
-        path = pathlib.Path(path)
-        path = path if path.suffix else path.with_suffix(".zip")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.partial")
-        try:
-            super().save(temporary, exclude, include)
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)

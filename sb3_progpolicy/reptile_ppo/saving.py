@@ -1,0 +1,372 @@
+"""Models as files: a zip of JSON and safetensors, from which nothing is unpickled.
+
+``model.json`` holds the constructor's :data:`ARGUMENTS`, the :data:`STATE` of the training and the optimizers'
+settings; ``tensors.safetensors`` parameters and moments. What is not data goes into ``<field>.pkl``, if at all.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import zipfile
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cloudpickle
+import numpy as np
+import safetensors
+import safetensors.numpy
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule, get_system_info
+
+from sb3_progpolicy.programs.files import write_atomically
+from sb3_progpolicy.reptile.tasks import SAMPLERS, TaskDistribution
+from sb3_progpolicy.reptile_ppo.values import ModelFormatError, NotDataError, from_data, to_data
+
+FORMAT, VERSION = "sb3-progpolicy model", 1
+DOCUMENT, TENSORS = "model.json", "tensors.safetensors"
+MAX_BYTES = {DOCUMENT: 2**24, TENSORS: 2**31}
+
+Check = Callable[[Any], bool]
+Tensors = dict[str, NDArray[Any]]
+
+
+def _number(value: Any) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)
+
+
+def _count(value: Any) -> bool:
+    return type(value) is int and 0 <= value < 2**53
+
+
+def _flag(value: Any) -> bool:
+    return type(value) is bool
+
+
+def _text(value: Any) -> bool:
+    return type(value) is str
+
+
+def _schedule(value: Any) -> bool:
+    return _number(value) or type(value) in (LinearSchedule, ConstantSchedule, FloatSchedule)
+
+
+def _mapping(value: Any) -> bool:
+    return type(value) is dict
+
+
+def _space(value: Any) -> bool:
+    return isinstance(value, spaces.Space)
+
+
+def _optional(check: Check) -> Check:
+    return lambda value: value is None or check(value)
+
+
+def _all(check: Check) -> Check:
+    return lambda value: isinstance(value, (list, tuple)) and all(check(item) for item in value)
+
+
+#: The constructor's arguments, and what a file may give for them.
+ARGUMENTS: Mapping[str, Check] = {
+    "policy": _text,
+    "learning_rate": _schedule,
+    "n_steps": _count,
+    "batch_size": _count,
+    "n_epochs": _count,
+    "gamma": _number,
+    "gae_lambda": _number,
+    "clip_range": _schedule,
+    "clip_range_vf": _optional(_schedule),
+    "normalize_advantage": _flag,
+    "ent_coef": _number,
+    "vf_coef": _number,
+    "max_grad_norm": _number,
+    "target_kl": _optional(_number),
+    "tasks": _mapping,
+    "env_kwargs": _mapping,
+    "inner_updates": _count,
+    "tasks_per_iteration": _count,
+    "meta_learning_rate": _schedule,
+    "meta_optimizer": _text,
+    "meta_update": _flag,
+    "search_fraction": _number,
+    "length_coef": _number,
+    "temperature": _optional(_schedule),
+    "action_std": _optional(_schedule),
+    "interaction_history": _flag,
+    "normalize_observations": _flag,
+    "scale_rewards": _flag,
+    "stats_window_size": _count,
+    "tensorboard_log": _optional(_text),
+    "policy_kwargs": _mapping,
+    "verbose": _count,
+    "seed": _optional(_count),
+}
+#: The state of a training besides tensors, and what a file may give for it.
+STATE: Mapping[str, Check] = {
+    "env_id": _optional(_text),
+    "n_envs": _count,
+    "observation_space": _space,
+    "action_space": _space,
+    "input_names": _optional(_all(_text)),
+    "output_names": _optional(_all(_text)),
+    "wrappers": _all(_text),
+    "num_timesteps": _count,
+    "total_timesteps": _count,
+    "progress_remaining": _number,
+    "n_updates": _count,
+    "meta_iteration": _count,
+    "rng": _mapping,
+    "reward_statistics": _optional(_all(_number)),
+    "episodes": _optional(_all(_all(_number))),
+    "successes": _optional(_all(lambda value: _flag(value) or _number(value))),
+}
+OPTIMIZERS = ("policy.optimizer", "outer_optimizer")
+ROLLOUT = ("_last_obs", "_last_episode_starts")
+
+
+@dataclass
+class SavedModel:
+    """What a file holds.
+
+    :param arguments: of the constructor
+    :param state: of the training
+    :param optimizers: their settings, by optimizer
+    :param tensors: by the names of what they belong to, a slash, and their own
+    """
+
+    arguments: dict[str, Any]
+    state: dict[str, Any]
+    optimizers: dict[str, Any]
+    tensors: Tensors
+
+    def under(self, prefix: str) -> Tensors:
+        """Return the tensors of one object, by their own names."""
+        return {name[len(prefix) + 1 :]: value for name, value in self.tensors.items() if name.startswith(prefix + "/")}
+
+
+# -------------------------------------------------------------------------------------------------------- write
+
+
+def write_model(
+    model: Any,
+    path: str | os.PathLike[str] | io.BufferedIOBase,
+    exclude: Iterable[str] | None,
+    include: Iterable[str] | None,
+    allow_pickle: bool,
+) -> None:
+    """Write a model; a file of the same name is replaced only when the new one is complete.
+
+    :param model: a ReptilePPO
+    :param path: of the file, or a stream of bytes
+    :param exclude: fields to leave out
+    :param include: fields not to leave out, though they are in ``exclude``
+    :param allow_pickle: pickle what is not data
+    :raises ValueError: if something is not data, or a number is not finite
+    """
+    left_out = set(exclude or ()) - set(include or ())
+    document: dict[str, Any] = {
+        "format": FORMAT,
+        "version": VERSION,
+        "saved_with": get_system_info(print_info=False)[0],
+    }
+    entries: dict[str, bytes] = {}
+    refused = []
+    for part, values in (("arguments", _arguments(model)), ("state", _state(model))):
+        document[part] = {}
+        for name, value in values.items():
+            if name in left_out:
+                continue
+            try:
+                document[part][name] = to_data(value)
+            except NotDataError as error:
+                refused.append(f"{name}: {error}")
+                if allow_pickle:
+                    entries[f"{name}.pkl"] = cloudpickle.dumps(value)
+    if refused and not allow_pickle:
+        raise NotDataError(
+            f"the model is not saved, as not all of it is data: {'; '.join(refused)}. Give numbers, text, lists or "
+            "SB3's schedules instead, or pickle it with save(..., allow_pickle=True)"
+        )
+    parameters = model.get_parameters()
+    document["optimizers"] = {name: to_data(parameters[name].get("param_groups", [])) for name in OPTIMIZERS}
+    entries[TENSORS] = safetensors.numpy.save(_tensors(model, parameters))
+    content = _zip({DOCUMENT: json.dumps(document, allow_nan=False).encode(), **entries})
+    if isinstance(path, (str, os.PathLike)):
+        path = _with_suffix(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, content)
+    else:
+        path.write(content)
+
+
+def _arguments(model: Any) -> dict[str, Any]:
+    """The constructor's arguments, read off a model; those that are no attributes of the same name come first."""
+    aliases = {policy: alias for alias, policy in model.policy_aliases.items()}
+    read: dict[str, Any] = {
+        "policy": aliases.get(model.policy_class, model.policy_class),
+        "tasks": _tasks_to_plain(model.tasks),
+        "scale_rewards": model.reward_scaler is not None,
+        "stats_window_size": model._stats_window_size,
+    }
+    return {name: read[name] if name in read else getattr(model, name) for name in ARGUMENTS}
+
+
+def _tasks_to_plain(tasks: TaskDistribution) -> Any:
+    samplers = {sampler: name for name, sampler in SAMPLERS.items()}
+    if type(tasks) is not TaskDistribution or type(tasks.sampler) not in samplers:
+        return tasks
+    return {
+        "variations": tasks.variations,
+        "sampler": samplers[type(tasks.sampler)],
+        "sampler_arguments": dict(vars(tasks.sampler)),
+        "apply": tasks.apply,
+        "success_rates": [None if np.isnan(rate) else float(rate) for rate in tasks.success_rates],
+    }
+
+
+def _state(model: Any) -> dict[str, Any]:
+    scaler, episodes, successes = model.reward_scaler, model.ep_info_buffer, model.ep_success_buffer
+    statistics = None if scaler is None else scaler.statistics
+    return {
+        "env_id": model.env_id,
+        "n_envs": model.n_envs,
+        "observation_space": model.observation_space,
+        "action_space": model.action_space,
+        "input_names": model.input_names,
+        "output_names": model.output_names,
+        "wrappers": model.wrappers,
+        "num_timesteps": model.num_timesteps,
+        "total_timesteps": model._total_timesteps,
+        "progress_remaining": model._current_progress_remaining,
+        "n_updates": model._n_updates,
+        "meta_iteration": model.meta_iteration,
+        "rng": model.rng.bit_generator.state,
+        "reward_statistics": statistics and [float(x) for x in (statistics.mean, statistics.var, statistics.count)],
+        "episodes": None if episodes is None else [[episode[key] for key in "rlt"] for episode in episodes],
+        "successes": None if successes is None else list(successes),
+    }
+
+
+def _tensors(model: Any, parameters: Mapping[str, Any]) -> Tensors:
+    tensors = {f"policy/{name}": tensor for name, tensor in parameters["policy"].items()}
+    for optimizer in OPTIMIZERS:
+        for index, values in parameters[optimizer].get("state", {}).items():
+            tensors |= {f"{optimizer}/{index}/{name}": th.as_tensor(value) for name, value in values.items()}
+    arrays = {name: np.ascontiguousarray(tensor.detach().cpu().numpy()) for name, tensor in tensors.items()}
+    arrays = {name: array.reshape(tensors[name].shape) for name, array in arrays.items()}
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise ValueError(f"the model is not saved: {name} holds numbers that are not finite")
+    if isinstance(model._last_obs, np.ndarray):
+        arrays |= {f"rollout/{name}": np.ascontiguousarray(getattr(model, name)) for name in ROLLOUT}
+    return arrays
+
+
+def _zip(entries: Mapping[str, bytes]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name, content in entries.items():
+            archive.writestr(zipfile.ZipInfo(name), content)  # without the time: equal models are equal files
+    return buffer.getvalue()
+
+
+def _with_suffix(path: str | os.PathLike[str]) -> Path:
+    path = Path(path)
+    return path if path.suffix else path.with_suffix(".zip")
+
+
+# -------------------------------------------------------------------------------------------------------- read
+
+
+def is_sb3_file(path: str | os.PathLike[str] | io.BufferedIOBase) -> bool:
+    """Return whether a file is SB3's zip, which holds pickles, as release 0.1 wrote it."""
+    return "data" in _read_zip(path, only=())
+
+
+def read_model(
+    path: str | os.PathLike[str] | io.BufferedIOBase, allow_pickle: bool = False, replaced: Collection[str] = ()
+) -> SavedModel:
+    """Read and check a file.
+
+    :param path: of the file, or a stream of bytes
+    :param allow_pickle: unpickle what is not data, which runs code that the file gives
+    :param replaced: fields that are not needed
+    :raises ModelFormatError: if the file is damaged or holds what is not accepted
+    :raises ValueError: if the file holds pickles and ``allow_pickle`` is not given
+    """
+    entries = _read_zip(path, only=None if allow_pickle else (DOCUMENT, TENSORS))
+    pickled = {name.removesuffix(".pkl") for name in entries if name.endswith(".pkl")} - set(replaced)
+    if pickled and not allow_pickle:
+        raise ValueError(
+            f"{path} holds pickles ({', '.join(sorted(pickled))}), and loading one runs the code in it. If you trust "
+            "where it comes from, load it with allow_pickle=True"
+        )
+    document = _parse(entries[DOCUMENT])
+    parts = []
+    for part, checks in (("arguments", ARGUMENTS), ("state", STATE)):
+        values = document[part]
+        for name, value in values.items():
+            if name not in checks or not checks[name](value):
+                raise ModelFormatError(f"{part}: {name!r:.40}={value!r:.60} is not accepted")
+        parts.append({**values, **{name: cloudpickle.loads(entries[f"{name}.pkl"]) for name in pickled & set(checks)}})
+    try:
+        tensors = safetensors.numpy.load(entries[TENSORS])
+    except (safetensors.SafetensorError, KeyError, ValueError, TypeError) as error:
+        raise ModelFormatError(f"{TENSORS} is damaged: {error}") from None
+    return SavedModel(parts[0], parts[1], document["optimizers"], tensors)
+
+
+def _read_zip(path: str | os.PathLike[str] | io.BufferedIOBase, only: Collection[str] | None) -> dict[str, bytes]:
+    """Return the entries by name, empty but for those in ``only``; ``None`` reads all."""
+    if isinstance(path, (str, os.PathLike)):
+        path = path if Path(path).exists() else _with_suffix(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            infos = archive.infolist()
+            names = [info.filename for info in infos]
+            fields = {f"{name}.pkl" for name in (*ARGUMENTS, *STATE)}
+            if "data" in names:
+                return dict.fromkeys(names, b"")
+            if len(set(names)) < len(names) or not {DOCUMENT, TENSORS} <= set(names) <= {DOCUMENT, TENSORS, *fields}:
+                raise ModelFormatError(f"the file holds {names[:6]!r:.200}; {DOCUMENT} and {TENSORS} are expected")
+            for info in infos:
+                if info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size:
+                    raise ModelFormatError(f"{info.filename} is compressed, which is not accepted")
+                if info.file_size > (most := MAX_BYTES.get(info.filename, MAX_BYTES[TENSORS])):
+                    raise ModelFormatError(f"{info.filename} has {info.file_size} bytes; at most {most} are accepted")
+            return {name: archive.read(name) if only is None or name in only else b"" for name in names}
+    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, OverflowError) as error:
+        raise ModelFormatError(f"not a model, or damaged: {error or type(error).__name__}") from None
+
+
+def _parse(raw: bytes) -> dict[str, Any]:
+    try:
+        document = from_data(json.loads(raw, object_pairs_hook=_without_repetition))
+    except RecursionError:
+        raise ModelFormatError(f"{DOCUMENT} is nested too deeply") from None
+    except ModelFormatError:
+        raise
+    except ValueError as error:
+        raise ModelFormatError(f"{DOCUMENT} is damaged: {error}") from None
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise ModelFormatError(f'{DOCUMENT} does not say "format": "{FORMAT}"')
+    if document.get("version") != VERSION:
+        raise ModelFormatError(f"version {document.get('version')!r:.20} is not accepted; this release reads {VERSION}")
+    if not all(isinstance(document.get(part), dict) for part in ("arguments", "state", "optimizers")):
+        raise ModelFormatError(f"{DOCUMENT} lacks arguments, state or optimizers")
+    return document
+
+
+def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result = dict(pairs)
+    if len(result) != len(pairs):
+        raise ValueError("an object that holds the same key twice")
+    return result
