@@ -24,8 +24,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from progpolicy_envs import DOMAINS
-from sb3_progpolicy.grouped import GroupedSubprocVecEnv
-from sb3_progpolicy.vec_env import make_fast_vec_env
+from sb3_progpolicy.vec_env import GroupedSubprocVecEnv, make_fast_vec_env
 
 TASKS = [domain.id for domain in DOMAINS.values() if domain.simulation]
 

@@ -8,7 +8,6 @@ import progpolicy_envs  # registers the environments
 if TYPE_CHECKING:
     from sb3_progpolicy.evaluation import Evaluation, evaluate_model, evaluate_program
     from sb3_progpolicy.extraction import extract_program, holds_program
-    from sb3_progpolicy.grouped import GroupedSubprocVecEnv, GroupedVecEnv
     from sb3_progpolicy.interaction import InteractionHistory, VecInteractionHistory
     from sb3_progpolicy.policies import ProgrammaticPolicy, RecurrentProgrammaticPolicy
     from sb3_progpolicy.pretrained import load_pretrained, pretrained_names
@@ -16,14 +15,14 @@ if TYPE_CHECKING:
     from sb3_progpolicy.reptile.checkpoint import ReptileCheckpoint, load_last_good
     from sb3_progpolicy.reptile.tasks import RemakeOnVariation, TaskDistribution
     from sb3_progpolicy.reptile_ppo import ReptilePPO
-    from sb3_progpolicy.vec_env import BatchedVecEnv, make_fast_vec_env
+    from sb3_progpolicy.vec_env import BatchedVecEnv, GroupedSubprocVecEnv, GroupedVecEnv, make_fast_vec_env
 
 # Modules are imported when a name is first used: reading and running a program needs no torch.
 _MODULES = {
     "BatchedVecEnv": "vec_env",
     "Evaluation": "evaluation",
-    "GroupedSubprocVecEnv": "grouped",
-    "GroupedVecEnv": "grouped",
+    "GroupedSubprocVecEnv": "vec_env",
+    "GroupedVecEnv": "vec_env",
     "InteractionHistory": "interaction",
     "ProgrammaticPolicy": "policies",
     "RecurrentProgrammaticPolicy": "policies",

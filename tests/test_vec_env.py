@@ -1,4 +1,7 @@
-"""The batched environment against single ones in SB3's own vectorisation."""
+"""What make_fast_vec_env makes of an id, against single environments in SB3's own vectorisation."""
+
+import multiprocessing
+import os
 
 import gymnasium as gym
 import numpy as np
@@ -8,7 +11,7 @@ from gymnasium.wrappers import RecordEpisodeStatistics
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, is_vecenv_wrapped
 
-from sb3_progpolicy.vec_env import BatchedVecEnv, make_fast_vec_env
+from sb3_progpolicy.vec_env import BatchedVecEnv, GroupedSubprocVecEnv, GroupedVecEnv, make_fast_vec_env
 
 N_ENVS = 4
 
@@ -125,3 +128,68 @@ def test_options_that_only_some_environments_are_given_leave_the_others_as_they_
     env.reset()
     variations = [info["variation"] for info in env.unwrapped.reset_infos]
     assert [(variation["n_discs"], variation["source"]) for variation in variations] == [(1, 0), (3, 1)]
+
+
+def set_cores(monkeypatch, cores):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)), raising=False)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kind"), [({}, GroupedVecEnv), ({"observation": "goal"}, GroupedSubprocVecEnv)], ids=["flat", "goal"]
+)
+def test_simulations_are_grouped_and_equal_single_ones(monkeypatch, arguments, kind):
+    set_cores(monkeypatch, 2)
+    options = [{"n_targets": n} for n in (1, 2, 3)]
+    arguments = {**arguments, "max_episode_steps": 15}
+    grouped = make_fast_vec_env("PandaReach-v0", 3, seed=5, **arguments)
+    single = make_vec_env("PandaReach-v0", 3, seed=5, env_kwargs=arguments)
+    try:
+        assert type(grouped.unwrapped) is kind
+        assert len(grouped.unwrapped.processes) == 1
+        for env in (grouped, single):
+            env.set_options(options)
+        np.testing.assert_equal(grouped.reset(), single.reset())
+        rng = np.random.default_rng(0)
+        for _ in range(40):
+            actions = rng.uniform(-1, 1, (3, 4)).astype(np.float32)
+            a, b = grouped.step(actions), single.step(actions)
+            np.testing.assert_equal(a[:3], b[:3])
+            for row in np.flatnonzero(b[2]):
+                info_a, info_b = a[3][row], b[3][row]
+                for key in ("is_success", "TimeLimit.truncated", "terminal_observation"):
+                    np.testing.assert_equal(info_a[key], info_b[key])
+                assert info_a["episode"]["l"] == info_b["episode"]["l"]
+                assert info_a["episode"]["r"] == pytest.approx(info_b["episode"]["r"], abs=1e-4)
+            if kind is GroupedSubprocVecEnv:
+                np.testing.assert_equal(*([{**info, "episode": None} for info in infos] for infos in (a[3], b[3])))
+    finally:
+        grouped.close()
+        single.close()
+
+
+@pytest.mark.parametrize(("env_id", "n_envs", "cores"), [("PandaReach-v0", 1, 8), ("PandaReach-v0", 2, 1)])
+def test_one_simulation_or_one_core_needs_no_process(monkeypatch, env_id, n_envs, cores):
+    set_cores(monkeypatch, cores)
+    env = make_fast_vec_env(env_id, n_envs)
+    assert isinstance(env.unwrapped, BatchedVecEnv)
+    env.close()
+
+
+@pytest.mark.parametrize("cores", [1, 2])
+def test_simulations_take_some_options_for_some_and_draw_pictures(monkeypatch, cores):
+    set_cores(monkeypatch, cores)
+    env = make_fast_vec_env("PandaReach-v0", 2, render_mode="rgb_array")
+    env.set_options([{"n_targets": 2}, {}])
+    env.reset()
+    assert [info["variation"] for info in env.unwrapped.reset_infos] == [{"n_targets": 2}, {"n_targets": 1}]
+    assert [picture.shape for picture in env.get_images()] == [(360, 480, 3)] * 2
+    assert env.render().shape[2] == 3
+    env.close()
+
+
+def test_no_process_is_started_where_none_may_be(monkeypatch):
+    set_cores(monkeypatch, 2)
+    monkeypatch.setattr(multiprocessing.current_process(), "daemon", True)
+    env = make_fast_vec_env("PandaReach-v0", 2)
+    assert isinstance(env.unwrapped, BatchedVecEnv)
+    env.close()
