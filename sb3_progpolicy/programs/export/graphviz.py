@@ -79,7 +79,7 @@ class _DotPrinter(ProgramVisitor[list[str]]):
                 self._sum(condition.readout_bias, condition.readout, self.program.input_names),
             ]
         units = [f"h{unit + 1}" for unit in range(condition.hidden_size)]
-        heard = largest_terms(0.0, input_importance(condition), self.program.input_names, 9, self.max_terms)
+        heard = largest_terms(input_importance(condition), self.program.input_names, 9, self.max_terms)
         return [
             f"B{index + 1} >= 0 ?",
             f"B{index + 1} = {self._sum(condition.readout_bias, condition.readout, units)}",
@@ -88,7 +88,7 @@ class _DotPrinter(ProgramVisitor[list[str]]):
         ]
 
     def _sum(self, constant: float, weights: tuple[float, ...], names: Any) -> str:
-        terms = largest_terms(constant, weights, names, self.decimals, self.max_terms)
+        terms = largest_terms(weights, names, self.decimals, self.max_terms)
         tokens = [
             f"{round(constant, self.decimals) or 0.0:.{self.decimals}f}",
             *(f"{weight:+.{self.decimals}f} {name}" for weight, name in terms.shown),

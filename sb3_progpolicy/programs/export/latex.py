@@ -22,7 +22,7 @@ _ESCAPES = {
     "`": r"\symbol{96}",
     **{character: f"\\{character}" for character in "#$%&_{}"},
 }
-# Letters beyond ASCII that LaTeX's standard fonts have. Any other character would be an error there.
+# Characters beyond ASCII that pass, because LaTeX's standard fonts have them. With many others it would stop.
 _LETTERS = frozenset(map(chr, range(0xC0, 0x100))) - frozenset("ÐÞðþ")
 # W, b, U and d hold the gates from top to bottom, in the order in which they are named here.
 _CELLS = {
@@ -46,8 +46,9 @@ def export_latex(
 ) -> str | None:
     r"""Typeset a program: the case distinction, the conditions' recurrences and all matrices, in the paper's notation.
 
-    The result is a fragment for a document that loads ``amsmath``. All weights are given, none is dropped. Names are
-    printed as they are; of the letters beyond ASCII, those from À to ÿ, and others as their code, such as ``\u2192``.
+    The result is a fragment for a document that loads ``amsmath``. All weights are given, none is dropped. No name
+    becomes a command. A character beyond ASCII is printed as its code, such as ``\u2192``, unless it is a letter of a
+    Western European language.
 
     :param program: what to typeset
     :param out_file: a path or an open text file to write to

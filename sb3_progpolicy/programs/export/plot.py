@@ -21,7 +21,7 @@ CONDITION_FILL, CONDITION_EDGE = "#fdf3dc", "#e0a526"
 LEAF_FILL, LEAF_EDGE = "#ffffff", "#b4bec4"
 RAISES, LOWERS = "#12715b", "#b5411f"
 MINUS = "\N{MINUS SIGN}"
-# Inches of the natural size; monospaced text makes every width known before drawing.
+# In inches, except for the font. The text is monospaced, so that its width is known before it is drawn.
 FONT_SIZE, CHARACTER, ROW, PAD, GAP = 9.0, 0.0753, 0.205, 0.14, 0.34
 MAX_ROWS, MAX_NAME = 12, 40
 
@@ -47,6 +47,8 @@ def plot_program(
     """Draw a program: conditions on the left from top to bottom, the controller that each leads to on the right.
 
     For every output the terms with the largest weights are named, green where they raise it, red where they lower it.
+    Long names are shortened. matplotlib draws names as they are; only its ``pgf`` backend takes all text for TeX, so do
+    not use that one for a program that you do not trust.
 
     :param program: what to draw
     :param ax: matplotlib axes to draw into; by default a new figure of the size that the program needs
@@ -132,7 +134,7 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
         else:
             units = [f"h{unit + 1}" for unit in range(condition.hidden_size)]
             constant, terms = self._terms(condition.readout_bias, condition.readout, units)
-            heard = largest_terms(0.0, input_importance(condition), inputs, 9, self.max_terms)
+            heard = largest_terms(input_importance(condition), inputs, 9, self.max_terms)
             lines = [f"memory h: {counted(condition.hidden_size, f'{CELL_NAMES[condition.cell]} unit')}"]
             lines += ["listens most to", *(f"  {_label(name)}" for _, name in heard.shown)] if heard.shown else []
         number = index + 1
@@ -164,7 +166,7 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
     def _terms(
         self, constant: float, weights: Sequence[float], names: Sequence[str]
     ) -> tuple[str, list[tuple[str, str]]]:
-        terms = largest_terms(constant, weights, names, self.decimals, self.max_terms)
+        terms = largest_terms(weights, names, self.decimals, self.max_terms)
         shown = [
             (f"{_number(weight, self.decimals, '+')} {_label(name)}", RAISES if weight > 0 else LOWERS)
             for weight, name in terms.shown

@@ -31,8 +31,8 @@ def export_python(program: ProgramData, out_file: str | os.PathLike[str] | Any |
     previous_done)`` and chooses the same actions as :class:`~sb3_progpolicy.programs.interpreter.ProgramRunner` with
     crisp semantics, to the last bit of every number: sums are taken in the same order.
 
-    The file is safe to run whoever made the program. The program's texts enter it as ASCII string literals and
-    comments with everything else escaped, and as variable names of letters, digits and underscores.
+    No text of a program becomes code, whoever made it: names and title are written as string literals and comments in
+    ASCII, with all other characters escaped. Variables are named with letters, digits and underscores only.
 
     :param program: what to write
     :param out_file: a path or an open text file to write to
@@ -232,7 +232,7 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
         ]
 
     def _affine(self, rows: Sequence[_Row], table: str) -> list[str]:
-        """Statements that compute all rows, in the order of X; a table answers for a one-hot previous action."""
+        """Statements that compute all rows, with the terms in the order of X. A one-hot action's come from a table."""
         n, lines, picked = self.program.n_observations, [], []
         first = n
         for part in range(self.parts):
@@ -258,7 +258,7 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
         return lines
 
     def _table(self, name: str, columns: Sequence[Sequence[float]], first: int) -> None:
-        """A constant: for every previous action what it adds to each row, and zeros for none, found at index -1."""
+        """A constant: what each previous action adds to every row. The last line, at index -1, is for no action."""
         self.tables += ["", f"{name} = ("]
         for choice, column in enumerate(columns):
             comment = f"# {_commented(self.program.input_names[first + choice])}"
@@ -309,7 +309,7 @@ def _token(term: tuple[float, str]) -> str:
 
 
 def _cell(cell: str, unit: str) -> Iterator[str]:
-    """One unit of PyTorch's GRU or LSTM after its sums are taken; an RNN has to finish all units first."""
+    """Update one unit of a GRU or an LSTM from its sums, by PyTorch's equations; an RNN's are updated together."""
     if cell == "gru":
         yield f"r{unit} = 0.5 + 0.5 * tanh(0.5 * r{unit})"
         yield f"z{unit} = 0.5 + 0.5 * tanh(0.5 * z{unit})"

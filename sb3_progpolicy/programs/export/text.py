@@ -29,8 +29,8 @@ _RULES = {
 def export_text(program: ProgramData, decimals: int = 2, max_terms: int | None = 6) -> str:
     """Print a program as an indented if-then-else that a person can read.
 
-    The terms of every sum stand in order of size; those that round to zero or come after ``max_terms`` are counted
-    at the end of the line. The full numbers are in :func:`export_python` and in the saved file.
+    The terms of every sum stand in order of size. Those that round to zero or come after ``max_terms`` are only
+    counted. :func:`export_python` and the saved file hold all numbers in full.
 
     :param program: what to print
     :param decimals: digits after the point
@@ -132,7 +132,7 @@ class _TextPrinter(ProgramVisitor[list[str]]):
         return pack(tokens, start, " " * min(len(start), WIDTH // 2), WIDTH)
 
     def _tokens(self, constant: float, weights: Sequence[float], names: Sequence[str]) -> list[str]:
-        terms = largest_terms(constant, weights, names, self.decimals, self.max_terms)
+        terms = largest_terms(weights, names, self.decimals, self.max_terms)
         tokens = [f"{constant:.{self.decimals}f}"] if round(constant, self.decimals) else []
         for weight, name in terms.shown:
             sign = "-" if weight < 0 else "+" if tokens else ""

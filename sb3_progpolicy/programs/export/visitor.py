@@ -46,29 +46,25 @@ class ProgramVisitor(ABC, Generic[Result]):
 
 @dataclass(frozen=True)
 class Terms:
-    """A sum cut down to what a reader should see.
+    """The terms of a sum that a reader should see.
 
-    :param constant: the constant term
     :param shown: (weight, name), the largest weight first
-    :param n_dropped: how many further terms are not zero but not shown
+    :param n_dropped: how many other terms are not zero
     """
 
-    constant: float
     shown: tuple[tuple[float, str], ...]
     n_dropped: int
 
 
-def largest_terms(
-    constant: float, weights: Sequence[float], names: Sequence[str], decimals: int, max_terms: int | None
-) -> Terms:
-    """Sort the terms of ``constant + weights · names`` by size and drop those that round to zero.
+def largest_terms(weights: Sequence[float], names: Sequence[str], decimals: int, max_terms: int | None) -> Terms:
+    """Sort the terms of ``weights · names`` by size and drop those that round to zero.
 
     :param decimals: digits after the point
     :param max_terms: show no more than these; ``None`` for all
     """
     terms = sorted(((weight, name) for weight, name in zip(weights, names, strict=True) if weight), key=_by_size)
     shown = [term for term in terms if round(term[0], decimals)][:max_terms]
-    return Terms(constant, tuple(shown), len(terms) - len(shown))
+    return Terms(tuple(shown), len(terms) - len(shown))
 
 
 def _by_size(term: tuple[float, str]) -> float:
@@ -76,8 +72,8 @@ def _by_size(term: tuple[float, str]) -> float:
 
 
 def input_importance(condition: Condition) -> tuple[float, ...]:
-    """How strongly a condition listens to each number of X: the absolute weights into each unit, times the unit's own
-    absolute weight in B, summed.
+    """How much each number of X can move a condition: its absolute weights into the units, each times the absolute
+    weight of that unit in B, summed.
     """
     if condition.cell == "affine":
         return tuple(abs(weight) for weight in condition.readout)
@@ -105,7 +101,7 @@ def action_rule(action: ActionSpec) -> str:
 
 
 def title(program: ProgramData) -> str:
-    """The program's name, from ``metadata["env"]`` where that is a printable string."""
+    """The program's name, with ``metadata["env"]`` where that is a printable string of at most 100 characters."""
     environment = program.metadata.get("env")
     known = isinstance(environment, str) and environment.isprintable() and 0 < len(environment) <= 100
     return f"Program for {environment}" if known else "Program"
