@@ -59,7 +59,7 @@ def test_pendulum_is_learned(algorithm, policy):
     model.learn(22_000)
     # Random actions and a policy that stands still both get about -1200.
     assert before < -900
-    assert mean_return(model, "Pendulum-v1") > -600
+    assert mean_return(model, "Pendulum-v1") > -700
 
 
 @BOTH
