@@ -1,10 +1,8 @@
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import imageio_ffmpeg
@@ -46,8 +44,23 @@ def trained(tmp_path_factory):
     return folder / "reptile_ppo" / "Hanoi-v0_1"
 
 
-def process(*arguments):
-    code = "from sb3_progpolicy.cli import main; main()"
+# Ctrl-C from a thread of the process itself: a process of its own may be too late on a busy machine.
+INTERRUPTED = """
+import os, signal, sys, threading, time
+from pathlib import Path
+from sb3_progpolicy.cli import main
+
+def interrupt(checkpoint):
+    while not checkpoint.exists():
+        time.sleep(0.001)
+    os.kill(os.getpid(), signal.SIGINT)
+
+threading.Thread(target=interrupt, args=(Path(sys.argv.pop(1)),), daemon=True).start()
+main()
+"""
+
+
+def process(*arguments, code="from sb3_progpolicy.cli import main; main()"):
     return subprocess.Popen(
         [sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
@@ -203,14 +216,11 @@ def test_mistake_is_one_line_and_exit_code_2(arguments, said, program, tmp_path,
 
 def test_interrupted_run_says_how_to_go_on_and_ends_the_same(tmp_path, capsys):
     options = ["--seed", "5", "-n", "8000", "--hyperparams", "inner_updates:2", *TINY]
-    running = process("train", "-f", str(tmp_path / "a"), *options, "--save-freq", "500")
     folder = tmp_path / "a" / "reptile_ppo" / "Hanoi-v0_1"
-    while not (folder / "model.zip").exists():
-        assert running.poll() is None, running.communicate()
-        time.sleep(0.01)
-    running.send_signal(signal.SIGINT)
-    _, err = running.communicate(timeout=60)
-    assert running.returncode == 130
+    arguments = ["train", "-f", str(tmp_path / "a"), *options, "--save-freq", "500"]
+    running = process(str(folder / "model.zip"), *arguments, code=INTERRUPTED)
+    _, err = running.communicate(timeout=120)
+    assert running.returncode == 130, err
     assert "Traceback" not in err
     assert f"progpolicy train --resume {folder}" in err
     assert 0 < load_program(folder / "program.json").metadata["timesteps"] < 8000

@@ -36,9 +36,9 @@ def make(policy):
     )
 
 
-def train(model, path):
+def train(model, path, checkpoint_class=ReptileCheckpoint):
     """Train to the end, with checkpoints, and return the final parameters by name."""
-    checkpoint = ReptileCheckpoint(path, save_freq=512, verbose=1)
+    checkpoint = checkpoint_class(path, save_freq=512)
     model.learn(TIMESTEPS - model.num_timesteps, checkpoint, reset_num_timesteps=model.num_timesteps == 0)
     model.save(path.with_suffix(".final.zip"))
     return parameters(path)
@@ -51,8 +51,7 @@ def parameters(path):
 def start(call):
     """Run a piece of this module in a process of its own."""
     code = f"from pathlib import Path; import torch; torch.set_num_threads(1); from tests.test_resume import *; {call}"
-    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment)
+    return subprocess.Popen([sys.executable, "-c", code])
 
 
 @pytest.fixture
@@ -82,23 +81,6 @@ def assert_same_bits(expected, actual):
         assert same, name
 
 
-def test_killed_and_resumed_training_ends_with_the_same_bits(tmp_path, one_thread):
-    whole, killed = tmp_path / "whole.zip", tmp_path / "killed.zip"
-    process = start(f"train(make('ProgPolicy'), Path({str(killed)!r}))")
-    checkpoints = (line for line in process.stdout if line.startswith("Checkpoint"))
-    next(checkpoints), next(checkpoints)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert 0 < ReptilePPO.load(killed).num_timesteps < TIMESTEPS
-    assert not killed.with_suffix(".final.zip").exists()
-
-    resumed = start(f"train(ReptilePPO.load({str(killed)!r}, env='Hanoi-v0'), Path({str(killed)!r}))")
-    expected = train(make("ProgPolicy"), whole)
-    resumed.communicate(timeout=120)
-    assert resumed.returncode == 0
-    assert_same_bits(expected, parameters(killed))
-
-
 class Stop(Exception):
     pass
 
@@ -106,18 +88,39 @@ class Stop(Exception):
 class StopAt(ReptileCheckpoint):
     """Fails in the middle of a rollout."""
 
-    stop_at = 0
+    stop_at = TIMESTEPS // 2 + 100
 
     def _on_step(self):
         if self.num_timesteps >= self.stop_at:
-            raise Stop
+            self.stop()
         return True
+
+    def stop(self):
+        raise Stop
+
+
+class KillAt(StopAt):
+    """Ends the whole process there, as ``kill -9`` does."""
+
+    def stop(self):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_killed_and_resumed_training_ends_with_the_same_bits(tmp_path, one_thread):
+    whole, killed = tmp_path / "whole.zip", tmp_path / "killed.zip"
+    assert start(f"train(make('ProgPolicy'), Path({str(killed)!r}), KillAt)").wait(timeout=120) == -signal.SIGKILL
+    assert 0 < ReptilePPO.load(killed).num_timesteps < TIMESTEPS
+    assert not killed.with_suffix(".final.zip").exists()
+
+    resumed = start(f"train(ReptilePPO.load({str(killed)!r}, env='Hanoi-v0'), Path({str(killed)!r}))")
+    expected = train(make("ProgPolicy"), whole)
+    assert resumed.wait(timeout=120) == 0
+    assert_same_bits(expected, parameters(killed))
 
 
 @pytest.mark.parametrize("policy", ["MlpPolicy", "PRLPolicy"])
 def test_resumed_training_ends_with_the_same_bits_whatever_the_policy(policy, tmp_path, one_thread):
     stopped = StopAt(tmp_path / "stopped.zip")
-    stopped.stop_at = TIMESTEPS // 2 + 100
     with pytest.raises(Stop):
         make(policy).learn(TIMESTEPS, stopped)
     actual = train(ReptilePPO.load(stopped.path, env="Hanoi-v0"), stopped.path)
