@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 
 from sb3_progpolicy.cli import run
@@ -97,3 +98,74 @@ def test_what_is_no_configuration_is_refused(described):
 def test_text_that_is_no_plain_yaml_is_refused(text, said):
     with pytest.raises(ValueError, match=said):
         read_yaml(text)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["train", "-n", "0"],
+        ["train", "-n", "-5"],
+        ["train", "--seed", str(2**32)],
+        ["train", "--device", "meta"],
+        ["train", "--env", "not_a_module:Nope-v0"],
+        *(
+            ["train", "-n", "64", "--hyperparams", pair]
+            for pair in (
+                "learning_rate:-1",
+                "learning_rate:nan",
+                "learning_rate:.inf",
+                "learning_rate:lin_-1",
+                "learning_rate:lin_nan",
+                "gamma:2",
+                "gae_lambda:-0.1",
+                "clip_range:-0.1",
+                "action_std:0",
+                "search_fraction:1.5",
+                "length_coef:-1",
+                "n_epochs:0",
+                "ent_coef:inf",
+                "policy_kwargs:{depth: 0}",
+                "policy_kwargs:{depth: 1000000000}",
+                "policy_kwargs:dict(init_temperature=1e999)",
+                "n_envs:100000000",
+                "tasks:3",
+            )
+        ),
+        ["train", "-n", "64", "--env-kwargs", "n_discs:nan"],
+        ["train", "-n", "64", "--env-kwargs", "n_discs:[1]"],
+        *(["evaluate", "Hanoi-v0", "--set", pair] for pair in ("n_discs=nan", "n_discs=1.5", "n_discs={}", "n_discs=")),
+        *(["evaluate", "Hanoi-v0", "--set", pair] for pair in ("n_discs=null", "source=[0]", "source=9", "a=b=c", "3")),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_trained(arguments, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sb3_progpolicy.experiment.run.train", lambda *_: pytest.fail("it trains"))
+    assert run(arguments) == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_device_that_is_not_there_is_refused(tmp_path, capsys):
+    assert run(["train", "--device", "cuda", "-n", "64", "-f", str(tmp_path)]) == 2
+    assert "device='cuda' is not accepted here" in capsys.readouterr().err
+
+
+def test_version_and_help(capsys):
+    assert run(["--version"]) == 0
+    assert re.fullmatch(r"progpolicy \d+\.\d+\.\d+\S*\n", capsys.readouterr().out)
+    assert run([]) == 0
+    printed = capsys.readouterr().out
+    assert all(command in printed for command in ("train", "evaluate", "--version"))
+
+
+@pytest.mark.parametrize(
+    ("name", "start"),
+    [("a.py", b"#"), ("a.tex", b"{\\scriptsize"), ("a.dot", b"digraph"), ("a.PNG", b"\x89PNG"), ("a", b"Program")],
+)
+def test_format_follows_the_suffix_unless_it_is_given(name, start, tmp_path):
+    assert run(["show", "Hanoi-v0", "-o", str(tmp_path / name)]) == 0
+    assert (tmp_path / name).read_bytes().startswith((start, b'"""'))
+    assert run(["show", "Hanoi-v0", "-o", str(tmp_path / name), "--format", "text"]) == 0
+    assert (tmp_path / name).read_bytes().startswith(b"Program")
