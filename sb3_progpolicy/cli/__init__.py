@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import sys
+import tempfile
+import traceback
 from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from typing import Annotated
 
 import typer
 
@@ -14,7 +19,6 @@ from sb3_progpolicy.nearest import unknown
 app = typer.Typer(
     name="progpolicy",
     help="Learn readable programs by reinforcement learning, evaluate, show and render them.",
-    no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
 )
@@ -29,13 +33,30 @@ COMMANDS: dict[str, Callable[..., None]] = {
 for _name, _command in COMMANDS.items():
     app.command(_name)(_command)
 
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"progpolicy {version('sb3-progpolicy')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Learn readable programs by reinforcement learning, evaluate, show and render them."""
+
+
 #: Base of the errors that the parser raises; where it lives depends on Typer's version.
 _ParserError: type[Exception] = typer.BadParameter.__mro__[2]
-USAGE_ERROR, INTERRUPTED = 2, 130
+USAGE_ERROR, UNEXPECTED_ERROR, INTERRUPTED = 2, 1, 130
+TRACEBACK, MAX_LINE = "PROGPOLICY_TRACEBACK", 1000
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line and exit: 0, 2 for anything that is not accepted, 130 when interrupted.
+    """Run the command line and exit: 0, 2 for what is not accepted, 1 for an unexpected error, 130 when interrupted.
 
     :param arguments: without the program's name; ``sys.argv`` by default
     """
@@ -47,21 +68,36 @@ def run(arguments: Sequence[str]) -> int:
 
     :param arguments: without the program's name
     """
-    given = list(arguments)
+    given = list(arguments) or ["--help"]
     try:
         if given and not given[0].startswith("-") and given[0] not in COMMANDS:
             raise unknown("command", given[0], COMMANDS)
         code = app(repeat_flags(given), prog_name="progpolicy", standalone_mode=False)
     except _ParserError as error:
-        return _fail(error.format_message())  # type: ignore[attr-defined]
-    except (ValueError, OSError, ModuleNotFoundError) as error:
-        return _fail(str(error))
+        _say(error.format_message())  # type: ignore[attr-defined]
+        return USAGE_ERROR
     except (KeyboardInterrupt, typer.Abort):
         sys.stderr.write("interrupted\n")
         return INTERRUPTED
+    except Exception as error:
+        if os.environ.get(TRACEBACK, "0") != "0" or "--verbose 2" in " ".join(given).replace("=", " "):
+            traceback.print_exc()
+        if isinstance(error, (ValueError, OSError, ModuleNotFoundError)):
+            _say(str(error))
+            return USAGE_ERROR
+        _say(f"unexpected {type(error).__name__}: {str(error)[:200]}; its report is in {_write_report(given)}")
+        return UNEXPECTED_ERROR
     return code if isinstance(code, int) else 0
 
 
-def _fail(message: str) -> int:
-    sys.stderr.write("progpolicy: " + " ".join(message.split()) + "\n")
-    return USAGE_ERROR
+def _say(message: str) -> None:
+    line = " ".join(message.split())
+    sys.stderr.write(f"progpolicy: {line if len(line) <= MAX_LINE else line[:MAX_LINE] + ' ...'}\n")
+
+
+def _write_report(given: Sequence[str]) -> str:
+    """Write what is known of the error in hand to the temporary folder and return the file's name."""
+    with tempfile.NamedTemporaryFile("w", prefix="progpolicy-", suffix=".txt", delete=False, encoding="utf-8") as file:
+        file.write(f"progpolicy {version('sb3-progpolicy')}, Python {sys.version}\n{list(given)}\n\n")
+        file.write(traceback.format_exc())
+    return file.name

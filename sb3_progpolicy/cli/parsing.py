@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from progpolicy_envs import DOMAINS
-from sb3_progpolicy.hyperparams import parse_kwargs, parse_value
+from sb3_progpolicy.hyperparams import parse_kwargs, parse_value, shortened
 
 # Flags that, as in the zoo, take several values: `--hyperparams n_steps:64 gamma:0.9`.
 _MANY = {"--hyperparams": ":", "-params": ":", "--env-kwargs": ":", "--set": "="}
@@ -48,7 +48,7 @@ def parse_pairs(flag: str, pairs: Iterable[str]) -> dict[str, Any]:
     for pair in pairs:
         name, colon, value = pair.partition(":")
         if not colon or not name.isidentifier():
-            raise ValueError(f"{flag} {pair!r} is not accepted; give name:value")
+            raise ValueError(f"{flag} {shortened(pair)} is not accepted; give name:value")
         parsed[name] = parse_kwargs(name, value) if value.startswith("dict(") else parse_value(value)
     return parsed
 
@@ -64,7 +64,7 @@ def parse_variations(pairs: Iterable[str]) -> list[dict[str, Any]]:
         name, equals, listed = pair.partition("=")
         items = [item.strip() for item in listed.split(",")]
         if not equals or not name.isidentifier() or not all(items):
-            raise ValueError(f"--set {pair!r} is not accepted; give name=value, a list 5,6,7 or a range 1-8")
+            raise ValueError(f"--set {shortened(pair)} is not accepted; give name=value, a list 5,6,7 or a range 1-8")
         values[name] = [value for item in items for value in _expand(pair, item)]
     combinations = list(product(*values.values()))
     return [dict(zip(values, combination, strict=True)) for combination in combinations]

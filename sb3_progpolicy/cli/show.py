@@ -17,16 +17,21 @@ from sb3_progpolicy.programs.files import write_atomically
 from sb3_progpolicy.programs.program import Program
 
 FORMATS = ("text", "latex", "dot", "python", "png")
+_OF_SUFFIX = {".txt": "text", ".tex": "latex", ".dot": "dot", ".py": "python", ".png": "png"}
 
 
 def show(
     run_or_name: Annotated[str, typer.Argument(help="run folder, program (.json), model (.zip) or pretrained name")],
-    format_: Annotated[str, typer.Option("--format", help=", ".join(FORMATS))] = "text",
+    format_: Annotated[
+        str | None, typer.Option("--format", help=f"{', '.join(FORMATS)}; by default as the file's name ends, or text")
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="file to write; png: <environment>.png by default")
     ] = None,
 ) -> None:
     """Print a program as text, LaTeX, Graphviz or standalone Python, or draw it."""
+    if format_ is None:
+        format_ = _OF_SUFFIX.get(output.suffix.lower(), "text") if output is not None else "text"
     if format_ not in FORMATS:
         raise unknown("format", format_, FORMATS)
     if output is not None:

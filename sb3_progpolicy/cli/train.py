@@ -23,7 +23,9 @@ def train(
     env: Annotated[str, typer.Option("--env", help="environment id")] = "Hanoi-v0",
     seed: Annotated[int, typer.Option("--seed", help="of everything random; negative: drawn, and noted")] = -1,
     log_folder: Annotated[Path, typer.Option("-f", "--log-folder", help="folder of all runs")] = Path("runs"),
-    n_timesteps: Annotated[int, typer.Option("-n", "--n-timesteps", help="in place of the tuned number")] = -1,
+    n_timesteps: Annotated[
+        int | None, typer.Option("-n", "--n-timesteps", min=1, help="in place of the tuned number")
+    ] = None,
     hyperparams: Annotated[
         list[str] | None,
         typer.Option("-params", "--hyperparams", help="overrides: n_steps:64 policy_kwargs:'{depth: 2}'"),
@@ -69,13 +71,13 @@ def train(
     if resume is not None:
         _refuse_decided(context)
         folder = resume
-        model, config = run.resume(folder, n_timesteps if n_timesteps > 0 else None, max(0, verbose - 1))
+        model, config = run.resume(folder, n_timesteps, max(0, verbose - 1))
     else:
         config = configs.make_config(
             algo,
             env,
             secrets.randbelow(2**31) if seed < 0 else seed,
-            n_timesteps if n_timesteps > 0 else None,
+            n_timesteps,
             parse_pairs("--env-kwargs", env_kwargs or ()),
             parse_pairs("--hyperparams", hyperparams or ()),
             device,

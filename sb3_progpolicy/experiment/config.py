@@ -3,23 +3,47 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
+import torch as th
 from gymnasium.envs.registration import load_env_creator
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_progpolicy.evaluation import spec_of
 from sb3_progpolicy.experiment.methods import METHODS, get_method
-from sb3_progpolicy.hyperparams import load_hyperparams, parse_kwargs, parse_number
+from sb3_progpolicy.hyperparams import load_hyperparams, parse_kwargs, parse_number, shortened
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.reptile.callback import ReptileWrapper
 from sb3_progpolicy.reptile_ppo.environments import DEFAULT_N_ENVS
 
 #: Hyperparameters of ReptileWrapper, which a stock algorithm is trained with if any of them is given.
 REPTILE = ("tasks", "inner_updates", "tasks_per_iteration", "meta_learning_rate", "meta_optimizer", "meta_update")
+#: Largest seed, number of environments, and number of transitions in a rollout.
+MAX_SEED, MAX_ENVS, MAX_ROLLOUT = 2**32 - 1, 2**16, 2**28
 _SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "meta_learning_rate", "temperature", "action_std")
+# Bounds, both included, of the numbers that have any; all are finite.
+_POSITIVE = (math.ulp(0.0), math.inf)
+_BOUNDS = {
+    "learning_rate": (0.0, math.inf),
+    "meta_learning_rate": (0.0, math.inf),
+    "temperature": _POSITIVE,
+    "action_std": _POSITIVE,
+    "clip_range": _POSITIVE,
+    "clip_range_vf": _POSITIVE,
+    "max_grad_norm": _POSITIVE,
+    "target_kl": _POSITIVE,
+    "gamma": (0.0, 1.0),
+    "gae_lambda": (0.0, 1.0),
+    "search_fraction": (0.0, 1.0),
+    "vf_coef": (0.0, math.inf),
+    "length_coef": (0.0, math.inf),
+    "n_envs": (1, MAX_ENVS),
+    "n_steps": (1, MAX_ROLLOUT),
+    "n_timesteps": (1, 2**53),
+}
 # Arguments of the constructors that have a flag of their own or no place in a file.
 _ELSEWHERE = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
 _ELSEWHERE |= {"rollout_buffer_class", "rollout_buffer_kwargs"}
@@ -75,19 +99,79 @@ def make_config(
     if n_timesteps is not None:
         hyperparams["n_timesteps"] = n_timesteps
     env_kwargs = {**parse_kwargs("env_kwargs", hyperparams.pop("env_kwargs", None)), **(env_kwargs or {})}
-    _check_env_kwargs(env_id, env_kwargs)
-    accepted = _accepted(algo)
-    for name in hyperparams:
+    config = check_config(RunConfig(algo, env_id, seed, env_kwargs, hyperparams, device))
+    check_surroundings(config)
+    return config
+
+
+def parse_config(described: Any) -> RunConfig:
+    """Return the configuration that a run folder describes.
+
+    :param described: what its file holds
+    :raises ValueError: if it is not a mapping of the fields of :class:`RunConfig`, or a value is not accepted
+    """
+    names = [entry.name for entry in fields(RunConfig)]
+    if not isinstance(described, Mapping):
+        raise ValueError(f"{shortened(described)} is not accepted; it is a mapping of {', '.join(names)}")
+    for name in described:
+        if name not in names:
+            raise unknown("field", name, names)
+    for name in ("algo", "env", "seed", "hyperparams"):
+        if name not in described:
+            raise ValueError(f"{name} is missing")
+    return check_config(RunConfig(**described))
+
+
+def check_config(config: RunConfig) -> RunConfig:
+    """Return a configuration with every value as the type it has to be of.
+
+    :param config: with values from a file or the command line
+    :raises ValueError: if a name or a value is not accepted; the message names the nearest names
+    """
+    for name in ("algo", "env", "device"):
+        if not isinstance(getattr(config, name), str):
+            raise ValueError(f"{name}={shortened(getattr(config, name))} is not accepted; it is a text")
+    get_method(config.algo)
+    if isinstance(config.seed, bool) or not isinstance(config.seed, int) or not 0 <= config.seed <= MAX_SEED:
+        raise ValueError(f"seed={shortened(config.seed)} is not accepted; it is a whole number from 0 to {MAX_SEED}")
+    for name in ("env_kwargs", "hyperparams"):
+        if not isinstance(getattr(config, name), Mapping):
+            raise ValueError(f"{name}={shortened(getattr(config, name))} is not accepted; it is a mapping")
+    accepted = _accepted(config.algo)
+    for name in config.hyperparams:
         if name not in accepted:
             raise unknown("hyperparameter", name, [*accepted, "env_kwargs"])
-    checked = {name: _checked(name, value, accepted[name]) for name, value in hyperparams.items()}
-    config = RunConfig(algo, env_id, seed, env_kwargs, checked, device)
+    for name in ("policy", "n_timesteps"):
+        if name not in config.hyperparams:
+            raise ValueError(f"hyperparams: {name} is missing")
+    checked = {name: _checked(name, value, accepted[name]) for name, value in config.hyperparams.items()}
+    if checked.get("n_envs", 1) * checked.get("n_steps", 1) > MAX_ROLLOUT:
+        raise ValueError(f"n_envs times n_steps is more than {MAX_ROLLOUT} transitions, which is not accepted")
+    config = replace(config, hyperparams=checked)
     _check_policy(config)
     return config
 
 
+def check_surroundings(config: RunConfig) -> None:
+    """Check what a configuration can be trained with here: the environment and the device.
+
+    :param config: with checked values
+    :raises ValueError: if the environment is not known or does not take its arguments, or the device is not there
+    """
+    _check_env_kwargs(config.env, config.env_kwargs)
+    if config.device == "auto":
+        return
+    try:
+        th.zeros(1, device=config.device).item()
+    except Exception as error:  # torch raises an error of its own kind for every kind of device
+        reason = str(error).partition("\n")[0]
+        raise ValueError(f"device={shortened(config.device)} is not accepted here: {reason}") from None
+
+
 def _check_env_kwargs(env_id: str, env_kwargs: Mapping[str, Any]) -> None:
-    constructor = inspect.signature(load_env_creator(str(spec_of(env_id).entry_point))).parameters
+    entry_point = spec_of(env_id).entry_point
+    creator = entry_point if callable(entry_point) else load_env_creator(str(entry_point))
+    constructor = inspect.signature(creator).parameters
     if any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in constructor.values()):
         return
     for name in env_kwargs:
@@ -112,31 +196,39 @@ def _checked(name: str, value: Any, default: Any) -> Any:
     value = parse_number(value)
     if name == "policy_kwargs":
         return parse_kwargs(name, value)
+    if value is None and (default is None or name == "batch_size"):
+        return None
     if name in _SCHEDULES:
-        if value is not None and not isinstance(value, str):
-            return _number(name, value, "a number, lin_<from> or lin_<from>_<to>")
         if isinstance(value, str):
             parse_schedule(name, value)
-        return value
+            return value
+        return _number(name, value, "a number, lin_<from> or lin_<from>_<to>")
     if isinstance(default, bool):
         if not isinstance(value, bool):
-            raise ValueError(f"{name}={value!r} is not accepted; it is true or false")
+            raise ValueError(f"{name}={shortened(value)} is not accepted; it is true or false")
         return value
     if isinstance(default, int) or name in ("batch_size", "n_envs"):
-        if value is None and name == "batch_size":
-            return None
-        number = _number(name, value, "a whole number")
-        if number != int(number) or number < 1:
-            raise ValueError(f"{name}={value!r} is not accepted; it is a whole number of at least 1")
+        number = _number(name, value, "a whole number", (1, math.inf))
+        if number != int(number):
+            raise ValueError(f"{name}={shortened(value)} is not accepted; it is a whole number")
         return int(number)
-    if isinstance(default, float) or (name == "target_kl" and value is not None):
+    if isinstance(default, float) or name == "target_kl":
         return _number(name, value, "a number")
+    if isinstance(default, str) and not isinstance(value, str):
+        raise ValueError(f"{name}={shortened(value)} is not accepted; it is a text")
     return value
 
 
-def _number(name: str, value: Any, accepted: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f"{name}={value!r} is not accepted; it is {accepted}")
+def _number(name: str, value: Any, accepted: str, bounds: tuple[float, float] = (-math.inf, math.inf)) -> float:
+    """Return a finite number within the bounds of its name."""
+    low, high = _BOUNDS.get(name, bounds)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or value != value or abs(value) == math.inf:
+        raise ValueError(f"{name}={shortened(value)} is not accepted; it is {accepted}")
+    if not low <= value <= high:
+        limits = (
+            "above 0" if low == math.ulp(0.0) else f"of at least {low:g}" if value < low else f"of at most {high:g}"
+        )
+        raise ValueError(f"{name}={shortened(value)} is not accepted; it is {accepted} {limits}")
     return value
 
 
@@ -150,12 +242,14 @@ def parse_schedule(name: str, value: Any) -> Any:
     kind, *numbers = value.split("_")
     ends = [parse_number(number) for number in numbers]
     if kind != "lin" or len(ends) not in (1, 2) or not all(isinstance(end, float) for end in ends):
-        raise ValueError(f"{name}={value!r} is not accepted; it is a number, lin_<from> or lin_<from>_<to>")
+        raise ValueError(f"{name}={shortened(value)} is not accepted; it is a number, lin_<from> or lin_<from>_<to>")
+    for end in ends:
+        _number(name, end, "a schedule between numbers")
     return LinearSchedule(ends[0], ends[1] if len(ends) == 2 else 0.0, 1.0)
 
 
 def _check_policy(config: RunConfig) -> None:
-    policy, policies = config.hyperparams.get("policy"), METHODS[config.algo].all_policies
+    policy, policies = config.hyperparams["policy"], METHODS[config.algo].all_policies
     if policy not in policies:
         raise unknown("policy", policy, policies)
     known = {

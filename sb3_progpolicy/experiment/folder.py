@@ -14,9 +14,10 @@ import yaml
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_progpolicy.experiment.config import RunConfig
+from sb3_progpolicy.experiment.config import RunConfig, parse_config
 from sb3_progpolicy.experiment.methods import get_method
 from sb3_progpolicy.extraction import extract_program, holds_program
+from sb3_progpolicy.hyperparams import read_yaml
 from sb3_progpolicy.programs.files import write_atomically
 
 MODEL, PROGRAM, CONFIG, ARGUMENTS, VERSIONS = "model.zip", "program.json", "config.yml", "args.yml", "versions.yml"
@@ -62,11 +63,17 @@ def read_config(folder: str | Path) -> RunConfig:
     """
     path = Path(folder) / CONFIG
     try:
-        return RunConfig(**yaml.safe_load(path.read_text(encoding="utf-8")))
-    except FileNotFoundError:
+        described = read_yaml(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
         raise ValueError(f"{folder} is not a run folder; it has no {CONFIG}") from None
-    except (yaml.YAMLError, TypeError, UnicodeDecodeError):
-        raise ValueError(f"{path} is damaged; it does not describe a run") from None
+    except UnicodeDecodeError:
+        raise ValueError(f"{path} does not describe a run: it is not text") from None
+    except ValueError as error:
+        raise ValueError(f"{path} does not describe a run: it {error}") from None
+    try:
+        return parse_config(described)
+    except ValueError as error:
+        raise ValueError(f"{path} does not describe a run: {error}") from None
 
 
 def load_model(path: str | Path, env: VecEnv | None = None, **kwargs: Any) -> OnPolicyAlgorithm:

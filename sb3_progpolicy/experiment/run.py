@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from progpolicy_envs import DOMAINS
 from sb3_progpolicy.evaluation import evaluate_model, evaluate_program
-from sb3_progpolicy.experiment.config import REPTILE, RunConfig, parse_schedule
+from sb3_progpolicy.experiment.config import REPTILE, RunConfig, check_surroundings, parse_schedule
 from sb3_progpolicy.experiment.folder import EVALUATIONS, MODEL, load_model, read_config, save_results
 from sb3_progpolicy.experiment.methods import METHODS
 from sb3_progpolicy.extraction import extract_program, holds_program
@@ -53,8 +53,10 @@ def build_model(
         for name in ("n_envs", "interaction_history"):
             arguments.pop(name, None)
         return method.algorithm(method.policies.get(policy, policy), make_env(config), **arguments), wrapper
-    except (AssertionError, RuntimeError) as error:  # what SB3 and torch raise for some values
-        raise ValueError(str(error)) from None
+    except ValueError:
+        raise
+    except Exception as error:  # for a value of the wrong kind environments, SB3 and torch raise whatever they please
+        raise ValueError(f"{config.algo} on {config.env} cannot be made so: {error or type(error).__name__}") from error
 
 
 def _reptile_wrapper(config: RunConfig, arguments: dict[str, Any]) -> ReptileWrapper:
@@ -161,6 +163,7 @@ def resume(folder: Path, n_timesteps: int | None = None, verbose: int = 0) -> tu
     if not METHODS[config.algo].has_reptile:
         resumable = ", ".join(name for name, method in METHODS.items() if method.has_reptile)
         raise ValueError(f"{folder} is a run of {config.algo}; {resumable} can be resumed, for others use -i")
+    check_surroundings(config)
     if n_timesteps is not None:
         config = replace(config, hyperparams={**config.hyperparams, "n_timesteps": n_timesteps})
     if not (folder / MODEL).is_file():

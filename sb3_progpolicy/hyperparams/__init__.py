@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import math
 from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
@@ -12,6 +13,8 @@ import yaml
 from sb3_progpolicy.nearest import unknown
 
 DEFAULT = "default"
+#: Bounds far above what real files have; damaged or hostile ones would take memory or end in a traceback.
+MAX_CHARACTERS, MAX_ITEMS, MAX_DEPTH = 1_000_000, 10_000, 20
 
 
 def algorithms() -> list[str]:
@@ -26,25 +29,94 @@ def load_hyperparams(algo: str, env_id: str) -> dict[str, Any]:
     :param env_id: environment id, with or without a module prefix; one that the file does not name gets its
         ``default`` entry
     :return: values by name, as they stand in the file
-    :raises ValueError: if the algorithm is not known
+    :raises ValueError: if the algorithm is not known or its file is damaged
     """
     if algo not in algorithms():
         raise unknown("algorithm", algo, algorithms())
-    entries = yaml.safe_load((files(__name__) / f"{algo}.yml").read_text(encoding="utf-8"))
-    return dict(entries.get(env_id.rpartition(":")[2], entries[DEFAULT]))
+    entries = load_entries(algo)
+    entry = entries.get(env_id.rpartition(":")[2], entries.get(DEFAULT))
+    if not isinstance(entry, dict):
+        raise ValueError(f"{algo}.yml has no mapping of hyperparameters for {env_id} and none as {DEFAULT!r}")
+    return entry
+
+
+def load_entries(algo: str) -> dict[str, Any]:
+    """Read the whole file of an algorithm: hyperparameters by environment id, and ``default``.
+
+    :param algo: one of :func:`algorithms`
+    :raises ValueError: if the file is damaged
+    """
+    file = files(__name__) / f"{algo}.yml"
+    try:
+        entries = read_yaml(file.read_text(encoding="utf-8"))
+    except UnicodeDecodeError:
+        raise ValueError(f"{algo}.yml is not text") from None
+    except ValueError as error:
+        raise ValueError(f"{algo}.yml {error}") from None
+    if not isinstance(entries, dict):
+        raise ValueError(f"{algo}.yml is not a mapping from environment ids to hyperparameters")
+    return entries
+
+
+def read_yaml(text: str) -> Any:
+    """Return what a text denotes in YAML: texts, finite numbers, truth values, null, lists and mappings of these.
+
+    :param text: a file's content or a value
+    :raises ValueError: if it is anything else, or too long or nested too deeply; the message goes on after a name
+    """
+    if len(text) > MAX_CHARACTERS:
+        raise ValueError(f"has {len(text)} characters; at most {MAX_CHARACTERS} are accepted")
+    try:
+        value = yaml.safe_load(text)
+    except RecursionError:
+        raise ValueError("is nested too deeply") from None
+    except (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError):  # PyYAML lets some of its own slip out
+        raise ValueError("is not YAML") from None
+    _count_items(value, 0)
+    return value
+
+
+def _count_items(value: Any, depth: int) -> int:
+    """Return how many items a value has with all that is in it; aliases count as often as they stand for something."""
+    if depth > MAX_DEPTH:
+        raise ValueError("is nested too deeply")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"holds {value}; numbers are finite")
+    if value is None or isinstance(value, (str, bool, int, float)):
+        return 1
+    if not isinstance(value, (list, dict)):
+        raise ValueError(f"holds a {type(value).__name__}; texts, numbers, true, false, null, lists and mappings do")
+    if isinstance(value, dict) and not all(isinstance(key, str) for key in value):
+        raise ValueError("has a name that is not a text")
+    n_items = 1
+    for item in value.values() if isinstance(value, dict) else value:
+        n_items += _count_items(item, depth + 1)
+        if n_items > MAX_ITEMS:
+            raise ValueError(f"has more than {MAX_ITEMS} items")
+    return n_items
 
 
 def parse_value(text: str) -> Any:
     """Return the value that a text denotes in YAML; ``1e-3``, which YAML reads as a text, is a number here.
 
     :param text: such as ``"3"``, ``"lin_0.001"``, ``"{depth: 3}"``
-    :raises ValueError: if it is not YAML
+    :raises ValueError: if it is not YAML, or a number is not finite
     """
     try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
-        raise ValueError(f"{text!r} is not accepted; it is not a YAML value") from None
-    return parse_number(value)
+        value = parse_number(read_yaml(text))
+        _count_items(value, 0)
+    except ValueError as error:
+        raise ValueError(f"{shortened(text)} is not accepted; it {error}") from None
+    return value
+
+
+def shortened(value: Any) -> str:
+    """Return the ``repr`` of a value for an error message, cut where it is long."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # a number of thousands of digits, or a list within a list within ...
+        text = f"a {type(value).__name__}"
+    return text if len(text) <= 100 else f"{text[:80]} ... {text[-10:]}"
 
 
 def parse_number(value: Any) -> Any:
@@ -67,13 +139,18 @@ def parse_kwargs(name: str, value: Any) -> dict[str, Any]:
     if value is None:
         return {}
     if isinstance(value, Mapping):
-        return {str(key): parse_number(item) for key, item in value.items()}
-    try:
-        parsed = _literal(ast.parse(value, mode="eval").body)
-    except (TypeError, ValueError, SyntaxError, RecursionError, MemoryError):
-        parsed = None
+        parsed: Any = {str(key): parse_number(item) for key, item in value.items()}
+    else:
+        try:
+            parsed = _literal(ast.parse(value[:MAX_ITEMS], mode="eval").body)
+        except (TypeError, ValueError, SyntaxError, RecursionError, MemoryError):
+            parsed = None
     if not isinstance(parsed, dict) or not all(isinstance(key, str) for key in parsed):
-        raise ValueError(f"{name}={value!r} is not accepted; give a mapping or dict(name=value, ...) of literals")
+        given = shortened(value)
+        raise ValueError(f"{name}={given} is not accepted; give a mapping or dict(name=value, ...) of literals")
+    for key, item in parsed.items():
+        if isinstance(item, float) and not math.isfinite(item):
+            raise ValueError(f"{name}: {key}={item} is not accepted; numbers are finite")
     return parsed
 
 
