@@ -129,8 +129,6 @@ def evaluate_model(
 
     See :func:`evaluate_program` for the other arguments.
     """
-    keeps_state = bool(getattr(model, "interaction_history", False))
-
     env = model.get_env()
     _refuse_wrappers("the model", getattr(model, "wrappers", ()) if env is None else wrappers_of(env))
     normalizer = model.get_vec_normalize_env()
@@ -154,8 +152,7 @@ def evaluate_model(
 
         def act(observations: NDArray[Any], rewards: NDArray[np.float32], dones: NDArray[np.bool_]) -> NDArray[Any]:
             nonlocal state
-            starts = np.zeros_like(dones) if keeps_state else dones
-            actions, state = model.predict(observations, state, starts, deterministic=True)
+            actions, state = model.predict(observations, state, dones, deterministic=True)
             return actions
 
         return act

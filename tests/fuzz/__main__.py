@@ -3,12 +3,14 @@
 import argparse
 import time
 
-from tests.fuzz import exports, programs
+from tests.fuzz import configurations, exports, models, programs
 from tests.fuzz.runner import Fuzzer, run
 
 FUZZERS = {
     "programs": Fuzzer(programs.case, cases=10_000, short=400),
     "exports": Fuzzer(exports.case, cases=1_000, short=100),
+    "configurations": Fuzzer(configurations.case, cases=1_000, short=100),
+    "models": Fuzzer(models.case, cases=10_000, short=200),
 }
 
 
