@@ -1,0 +1,1 @@
+"""Fuzzers: many random cases from one seed, each of which may end in known ways only."""
