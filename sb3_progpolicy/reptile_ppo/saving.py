@@ -32,6 +32,7 @@ from sb3_progpolicy.reptile_ppo.values import ModelFormatError, NotDataError, fr
 FORMAT, VERSION = "sb3-progpolicy model", 1
 DOCUMENT, TENSORS = "model.json", "tensors.safetensors"
 MAX_BYTES = {DOCUMENT: 2**24, TENSORS: 2**31}
+MAX_CONTAINERS = 10**5
 
 Check = Callable[[Any], bool]
 Tensors = dict[str, NDArray[Any]]
@@ -348,6 +349,8 @@ def _read_zip(path: str | os.PathLike[str] | io.BufferedIOBase, only: Collection
 
 
 def _parse(raw: bytes) -> dict[str, Any]:
+    if raw.count(b"[") + raw.count(b"{") > MAX_CONTAINERS:
+        raise ModelFormatError(f"{DOCUMENT} holds more than {MAX_CONTAINERS} lists and objects")
     try:
         document = from_data(json.loads(raw, object_pairs_hook=_without_repetition))
     except RecursionError:

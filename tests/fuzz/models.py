@@ -1,13 +1,14 @@
-"""Damaged and hostile model files: each is refused with a ``ValueError``, or loads with finite numbers."""
+"""Damaged and hostile model files: each is refused with a ``ValueError``, or loads as a model of finite numbers."""
 
 from __future__ import annotations
 
+import copy
 import io
 import json
 import random
 import warnings
 import zipfile
-from functools import cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -81,9 +82,9 @@ def mutate_json(rng: random.Random, document: Any) -> None:
         if choice < 0.1:
             del at[key]
         elif choice < 0.15 and isinstance(at, dict):
-            at[rng.choice(["__class__", "policy", "learn", "x"])] = rng.choice(VALUES)
+            at[rng.choice(["__class__", "policy", "learn", "x"])] = copy.deepcopy(rng.choice(VALUES))
         else:
-            at[key] = rng.choice(VALUES)
+            at[key] = copy.deepcopy(rng.choice(VALUES))
         return
 
 
@@ -136,30 +137,35 @@ def mutate(rng: random.Random, content: bytes) -> tuple[str, bytes]:
         entries = entries if rng.random() < 0.8 else entries[: rng.randint(0, 2)]
     compression = zipfile.ZIP_DEFLATED if kind == "sizes" else zipfile.ZIP_STORED
     if kind == "sizes" and rng.random() < 0.5:
-        entries[rng.randrange(2)] = (rng.choice([DOCUMENT, TENSORS]), bytes(50_000_000))
+        entries[rng.randrange(2)] = (rng.choice([DOCUMENT, TENSORS]), bytes(5_000_000))
     return kind, write(entries, compression)
 
 
-@cache
-def _saved() -> bytes:
+@lru_cache
+def saved() -> bytes:
+    """The file that is damaged."""
     buffer = io.BytesIO()
     make_model().save(buffer)
     return buffer.getvalue()
 
 
 def case(rng: np.random.Generator, folder: Path) -> str:
-    """Damage a file; it is refused with a ``ValueError`` or loaded as a sound model, and nothing else is written."""
-    kind, damaged = mutate(random.Random(int(rng.integers(2**62))), _saved())
+    """Load one damaged file and return what came of it.
+
+    :raises AssertionError: if it is neither refused with a ``ValueError`` nor loaded as a sound model
+    """
+    kind, damaged = mutate(random.Random(int(rng.integers(2**32))), saved())
     path = folder / "model.zip"
     path.write_bytes(damaged)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
             model = ReptilePPO.load(path)
-        except ValueError as error:
-            if not 0 < len(str(error)) < 3000:
-                raise AssertionError(f"{kind}: {str(error)[:200]}") from error
-            return f"{kind}: refused"
-    assert all(tensor.isfinite().all() for tensor in model.policy.state_dict().values()), kind
-    assert [entry.name for entry in folder.iterdir()] == ["model.zip"], kind
-    return f"{kind}: loaded"
+    except ValueError as error:
+        outcome, message = f"{kind}: refused", str(error)
+    else:
+        assert all(tensor.isfinite().all() for tensor in model.policy.state_dict().values())
+        outcome, message = f"{kind}: loaded", "loaded"
+    assert 0 < len(message) < 3000, message[:200]
+    assert [entry.name for entry in folder.iterdir()] == ["model.zip"], "something was extracted"
+    return outcome

@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-SECONDS = 60.0  # of one case; far more than any needs
+SECONDS = 120.0  # of one case; far more than any needs
 MEGABYTES = 1024  # by which the memory of the process may grow
 
 
@@ -35,7 +35,7 @@ class Fuzzer:
 def run(fuzzer: Fuzzer, cases: int, seed: int) -> Counter[str]:
     """Play cases and count their outcomes.
 
-    :raises AssertionError: naming the first case that fails, takes more than a minute or a gigabyte
+    :raises AssertionError: naming the first case that fails, takes more than two minutes or a gigabyte
     """
     outcomes: Counter[str] = Counter()
     before = _peak_megabytes()
