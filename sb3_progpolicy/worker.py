@@ -104,7 +104,7 @@ class Worker:
         # Actions are an array, for which pickle is several times faster; other arguments may come from the main script.
         dumps = pickle.dumps if method == "step" else cloudpickle.dumps
         message = dumps((method, args, kwargs))
-        with _uninterrupted():
+        with uninterrupted():
             self._remote.send_bytes(_NUMBER.pack(self._n_calls + 1) + message)
             self._n_calls += 1
 
@@ -122,7 +122,7 @@ class Worker:
 
     def _take(self) -> bytes:
         self._remote.poll(None)
-        with _uninterrupted():
+        with uninterrupted():
             message = self._remote.recv_bytes()
             self._n_answered = _NUMBER.unpack_from(message)[0]
         return message
@@ -220,7 +220,7 @@ def _work(remote: Connection, pickled_venv_fn: bytes, seconds_awake: float) -> N
 
 
 @contextlib.contextmanager
-def _uninterrupted() -> Iterator[None]:
+def uninterrupted() -> Iterator[None]:
     """Put Ctrl-C and a request to terminate off to the end of the block; only the main thread knows interrupts."""
     put_off: list[tuple[int, Any]] = []
     handlers: dict[int, Any] = {}
