@@ -68,7 +68,14 @@ def process(*arguments, code="from sb3_progpolicy.cli import main; main()"):
 
 def test_run_folder_holds_model_program_and_what_was_run(trained):
     files = {path.name for path in trained.iterdir()}
-    assert files == {"model.zip", "program.json", "config.yml", "args.yml", "versions.yml", "evaluations.json"}
+    assert files - {".lock"} == {
+        "model.zip",
+        "program.json",
+        "config.yml",
+        "args.yml",
+        "versions.yml",
+        "evaluations.json",
+    }
     config = yaml.safe_load((trained / "config.yml").read_text())
     assert (config["algo"], config["env"], config["seed"]) == ("reptile_ppo", "Hanoi-v0", 0)
     assert config["hyperparams"]["n_steps"] == 16
@@ -87,10 +94,16 @@ def test_stock_algorithms_are_trained_and_evaluated(algo, tmp_path, capsys):
     assert run(["train", "--algo", algo, "--seed", "0", "-f", str(tmp_path), "-n", "256", *TINY]) == 0
     run_folder = tmp_path / algo / "Hanoi-v0_1"
     capsys.readouterr()
-    assert run(["evaluate", str(run_folder), "--set", "n_discs=1", "--max-steps", "5", "--json"]) == 0
+    evaluate = ["evaluate", str(run_folder), "--set", "n_discs=1", "--max-steps", "5", "--json"]
+    assert run(evaluate) == 2
+    assert "saved with pickle: loading it runs the code in it" in capsys.readouterr().err
+    assert run([*evaluate, "--allow-pickle"]) == 0
     (row,) = json.loads(capsys.readouterr().out)
     assert row["semantics"] is None
-    assert run(["show", str(run_folder)]) == 2
+    assert run(["show", str(run_folder), "--allow-pickle"]) == 2
+    start = ["train", "--algo", algo, "-i", str(run_folder), "-f", str(tmp_path / "b"), "-n", "64", *TINY]
+    assert run(start) == 2
+    assert run([*start, "--allow-pickle"]) == 0
 
 
 def test_evaluation_prints_only_json(program):

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import sys
 import tempfile
 import traceback
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -30,8 +31,23 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "play": play.play,
     "envs": envs.envs,
 }
+
+
+def _aborting(command: Callable[..., None]) -> Callable[..., None]:
+    """Let Ctrl-C be an ``Abort``, which every version of Typer hands on."""
+
+    @functools.wraps(command)
+    def call(**options: Any) -> None:
+        try:
+            command(**options)
+        except KeyboardInterrupt:
+            raise typer.Abort from None
+
+    return call
+
+
 for _name, _command in COMMANDS.items():
-    app.command(_name)(_command)
+    app.command(_name)(_aborting(_command))
 
 
 def _show_version(wanted: bool) -> None:

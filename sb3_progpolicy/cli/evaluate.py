@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sb3_progpolicy.cli.parsing import default_variations, parse_variations
+from sb3_progpolicy.cli.parsing import ALLOW_PICKLE, default_variations, parse_variations
 from sb3_progpolicy.cli.streams import quiet_stdout
-from sb3_progpolicy.experiment.sources import find_source
+from sb3_progpolicy.experiment.sources import Source, find_source
 from sb3_progpolicy.nearest import unknown
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ def evaluate(
     ] = None,
     env: Annotated[str | None, typer.Option("--env", help="another environment than it was trained in")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="a JSON list on stdout, nothing else")] = False,
+    allow_pickle: Annotated[bool, typer.Option("--allow-pickle", help=ALLOW_PICKLE)] = False,
 ) -> None:
     """Measure success and steps on variations, next to the steps of the domain's planner.
 
@@ -39,7 +40,8 @@ def evaluate(
     if semantics not in (*SEMANTICS, "both"):
         raise unknown("semantics", semantics, (*SEMANTICS, "both"))
     with quiet_stdout():
-        rows = _evaluate(run_or_name, variations, episodes, semantics, seed, max_steps, env)
+        source = find_source(run_or_name, allow_pickle)
+        rows = _evaluate(source, variations, episodes, semantics, seed, max_steps, env)
     if as_json:
         typer.echo(json.dumps([row.to_json() for row in rows], indent=2))
     else:
@@ -47,7 +49,7 @@ def evaluate(
 
 
 def _evaluate(
-    name: str,
+    source: Source,
     pairs: list[str] | None,
     episodes: int,
     semantics: str,
@@ -60,10 +62,9 @@ def _evaluate(
     from sb3_progpolicy.evaluation import evaluate_model, evaluate_program
 
     torch.set_num_threads(1)
-    source = find_source(name)
     env_id = env or source.env_id
     if env_id is None:
-        raise ValueError(f"{name} does not say which environment it is for; give --env")
+        raise ValueError(f"{source.name} does not say which environment it is for; give --env")
     chosen = parse_variations(pairs) if pairs else default_variations(env_id)
     common: dict[str, Any] = {"seed": seed, "max_steps": max_steps, "env_kwargs": source.env_kwargs}
     if source.program is None:

@@ -15,6 +15,8 @@ from sb3_progpolicy.hyperparams import parse_kwargs, parse_value, shortened
 _MANY = {"--hyperparams": ":", "-params": ":", "--env-kwargs": ":", "--set": "="}
 _RANGE = re.compile(r"(\d+)-(\d+)")
 MAX_VARIATIONS = 10_000
+#: Help of ``--allow-pickle``.
+ALLOW_PICKLE = "load a model of a stock algorithm, which runs the code in its file: only for files that you trust"
 
 
 def repeat_flags(arguments: Sequence[str]) -> list[str]:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sb3_progpolicy.cli.parsing import check_folder, default_variations, parse_variations
+from sb3_progpolicy.cli.parsing import ALLOW_PICKLE, check_folder, default_variations, parse_variations
 from sb3_progpolicy.cli.streams import quiet_stdout
 from sb3_progpolicy.experiment.sources import Source, find_source
 from sb3_progpolicy.nearest import unknown
@@ -32,6 +32,7 @@ def render(
     seed: Annotated[int, typer.Option("--seed", min=0, help="of the environment")] = 0,
     fps: Annotated[int | None, typer.Option("--fps", min=1, max=50, help="frames per second")] = None,
     max_steps: Annotated[int | None, typer.Option("--max-steps", min=1, help="cap of the episode")] = None,
+    allow_pickle: Annotated[bool, typer.Option("--allow-pickle", help=ALLOW_PICKLE)] = False,
 ) -> None:
     """Play one episode and write it as an animated GIF or an MP4 film."""
     if output.suffix.lower() not in _FORMATS:
@@ -42,12 +43,13 @@ def render(
     if semantics not in ("crisp", "soft"):
         raise unknown("semantics", semantics, ("crisp", "soft"))
     with quiet_stdout():
-        steps, success = _render(run_or_name, output, variation, planner, random, semantics, seed, fps, max_steps)
+        source = _environment_of(run_or_name) if planner or random else find_source(run_or_name, allow_pickle)
+        steps, success = _render(source, output, variation, planner, random, semantics, seed, fps, max_steps)
     typer.echo(f"Wrote {output}: {steps} steps, {'goal reached' if success else 'goal not reached'}", err=True)
 
 
 def _render(
-    name: str,
+    source: Source,
     output: Path,
     pairs: list[str] | None,
     planner: bool,
@@ -61,9 +63,8 @@ def _render(
 
     from sb3_progpolicy.evaluation import spec_of
 
-    source = _environment_of(name) if planner or random else find_source(name)
     if source.env_id is None:
-        raise ValueError(f"{name} does not say which environment it is for")
+        raise ValueError(f"{source.name} does not say which environment it is for")
     variations = parse_variations(pairs) if pairs else default_variations(source.env_id)[-1:]
     if len(variations) != 1:
         raise ValueError(f"--set gives {len(variations)} variations; one episode has one")

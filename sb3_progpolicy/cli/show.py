@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sb3_progpolicy.cli.parsing import check_folder
+from sb3_progpolicy.cli.parsing import ALLOW_PICKLE, check_folder
 from sb3_progpolicy.cli.streams import quiet_stdout
 from sb3_progpolicy.experiment.sources import find_source
 from sb3_progpolicy.nearest import unknown
@@ -28,6 +28,7 @@ def show(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="file to write; png: <environment>.png by default")
     ] = None,
+    allow_pickle: Annotated[bool, typer.Option("--allow-pickle", help=ALLOW_PICKLE)] = False,
 ) -> None:
     """Print a program as text, LaTeX, Graphviz or standalone Python, or draw it."""
     if format_ is None:
@@ -37,7 +38,7 @@ def show(
     if output is not None:
         check_folder(output)
     with quiet_stdout():
-        source = find_source(run_or_name)
+        source = find_source(run_or_name, allow_pickle)
         if source.program is None:
             raise ValueError(f"{run_or_name} is not a program; ProgPolicy and PRLPolicy learn programs")
         content = _printed(source.program, format_)

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import secrets
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
-from sb3_progpolicy.cli.parsing import parse_pairs
+from sb3_progpolicy.cli.parsing import ALLOW_PICKLE, parse_pairs
 from sb3_progpolicy.hyperparams import algorithms
 
 # Flags that decide the outcome, which a resumed run takes from its folder.
-_DECIDED = ("--algo", "--env", "--seed", "--hyperparams", "--env-kwargs", "--trained-agent", "--device")
+_DECIDED = (
+    *("--algo", "--env", "--seed", "--hyperparams", "--env-kwargs", "--trained-agent", "--device"),
+    *("--log-folder", "--tensorboard-log"),
+)
 
 
 def train(
@@ -52,6 +57,7 @@ def train(
     num_threads: Annotated[int, typer.Option("--num-threads", min=1, help="of torch")] = 1,
     device: Annotated[str, typer.Option("--device", help="cpu, cuda or auto")] = "auto",
     verbose: Annotated[int, typer.Option("--verbose", min=0, max=2, help="0, 1 or 2")] = 1,
+    allow_pickle: Annotated[bool, typer.Option("--allow-pickle", help=ALLOW_PICKLE)] = False,
 ) -> None:
     """Train and write a run folder: the model, its program, what was run with which versions.
 
@@ -64,45 +70,60 @@ def train(
     from sb3_progpolicy.experiment import run
 
     torch.set_num_threads(num_threads)
-    options = run.TrainingOptions(progress, save_freq, eval_freq, eval_episodes, log_interval)
     console = Console(stderr=True)
-    model: Any
-    wrapper = None
-    if resume is not None:
-        _refuse_decided(context)
-        folder = resume
-        model, config = run.resume(folder, n_timesteps, max(0, verbose - 1))
-    else:
-        config = configs.make_config(
-            algo,
-            env,
-            secrets.randbelow(2**31) if seed < 0 else seed,
-            n_timesteps,
-            parse_pairs("--env-kwargs", env_kwargs or ()),
-            parse_pairs("--hyperparams", hyperparams or ()),
-            device,
-        )
-        model, wrapper = run.build_model(config, tensorboard_log or None, max(0, verbose - 1))
-        if trained_agent:
-            run.start_from(model, trained_agent)
-        given = {name: str(value) if isinstance(value, Path) else value for name, value in context.params.items()}
-        folder = folders.create_run(log_folder, config, given)
-    if verbose:
-        console.print(f"{config.algo} on {config.env}, seed {config.seed}, {config.n_timesteps} steps: {folder}")
-    try:
-        run.train(model, config, folder, wrapper, options)
-    except run.Interrupted as interruption:
-        _say_how_to_go_on(interruption, folder, config, progress)
-        raise typer.Exit(130) from None
+    with run.terminable(), contextlib.ExitStack() as stack:
+        if resume is not None:
+            _refuse_decided(context)
+            if (resume / folders.CONFIG).is_file():
+                stack.enter_context(folders.locked(resume))
+            folder, wrapper, arguments = resume, None, {**folders.read_arguments(resume), **_given(context)}
+            model, config = run.resume(folder, n_timesteps, max(0, verbose - 1), allow_pickle)
+            folders.describe_run(folder, config, arguments)
+        else:
+            config = configs.make_config(
+                algo,
+                env,
+                secrets.randbelow(2**31) if seed < 0 else seed,
+                n_timesteps,
+                parse_pairs("--env-kwargs", env_kwargs or ()),
+                parse_pairs("--hyperparams", hyperparams or ()),
+                device,
+            )
+            model, wrapper = run.build_model(config, tensorboard_log or None, max(0, verbose - 1))
+            if trained_agent:
+                run.start_from(model, trained_agent, allow_pickle)
+            arguments = _plain(context.params)
+            folder = folders.create_run(log_folder, config, arguments)
+            stack.enter_context(folders.locked(folder))
+        if verbose:
+            console.print(f"{config.algo} on {config.env}, seed {config.seed}, {config.n_timesteps} steps: {folder}")
+        kept = {name: arguments.get(name, context.params[name]) for name in folders.KEPT_OPTIONS}
+        try:
+            run.train(model, config, folder, wrapper, run.TrainingOptions(progress, **kept))
+        except run.Interrupted as interruption:
+            _say_how_to_go_on(interruption, folder, config, progress)
+            raise typer.Exit(1 if interruption.reason else 130) from None
     if verbose:
         _show_result(folder, console)
 
 
+def _plain(options: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: str(value) if isinstance(value, Path) else value for name, value in options.items()}
+
+
+def _given(context: typer.Context) -> dict[str, Any]:
+    """The options on the command line, as against those that have their defaults."""
+    sources = {name: context.get_parameter_source(name) for name in context.params}
+    return _plain(
+        {name: context.params[name] for name, source in sources.items() if source and source.name == "COMMANDLINE"}
+    )
+
+
 def _refuse_decided(context: typer.Context) -> None:
+    given = _given(context)
     flags = {option: parameter.name for parameter in context.command.params for option in parameter.opts}
     for flag in _DECIDED:
-        source = context.get_parameter_source(str(flags[flag]))
-        if source is not None and source.name == "COMMANDLINE":
+        if flags[flag] in given:
             raise ValueError(f"{flag} is not accepted with --resume; a resumed run keeps what it was started with")
 
 
@@ -110,11 +131,14 @@ def _say_how_to_go_on(interruption: Any, folder: Path, config: Any, progress: bo
     flag = " -P" if progress else ""
     again = f"progpolicy train --resume {shlex.quote(str(folder))}{flag}"
     if not interruption.resumable:
-        again = (
-            f"progpolicy train --algo {config.algo} --env {shlex.quote(config.env)} -i {shlex.quote(str(folder))}{flag}"
-        )
+        start = f"progpolicy train --algo {config.algo} --env {shlex.quote(config.env)}"
+        again = f"{start} -i {shlex.quote(str(folder))} --allow-pickle{flag}"
     # Not by rich, which would break the command into lines of the terminal's width.
-    typer.echo(f"\nInterrupted; saved at step {interruption.timesteps} in {folder}. To go on:\n  {again}", err=True)
+    saved = f"saved at step {interruption.timesteps} in {folder}. To go on:"
+    if interruption.reason:
+        typer.echo(f"progpolicy: {' '.join(interruption.reason.split())}; {saved} {again}", err=True)
+    else:
+        typer.echo(f"\nInterrupted; {saved}\n  {again}", err=True)
 
 
 def _show_result(folder: Path, console: Console) -> None:

@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
+import contextlib
+import inspect
 import io
+import json
 import platform
-from collections.abc import Mapping
+import zipfile
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import yaml
+from filelock import FileLock, Timeout
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_progpolicy.experiment.config import RunConfig, parse_config
 from sb3_progpolicy.experiment.methods import get_method
 from sb3_progpolicy.extraction import extract_program, holds_program
-from sb3_progpolicy.hyperparams import read_yaml
+from sb3_progpolicy.hyperparams import read_yaml, shortened
 from sb3_progpolicy.programs.files import write_atomically
+from sb3_progpolicy.worker import uninterrupted
 
 MODEL, PROGRAM, CONFIG, ARGUMENTS, VERSIONS = "model.zip", "program.json", "config.yml", "args.yml", "versions.yml"
-EVALUATIONS = "evaluations.json"
+EVALUATIONS, LOCK = "evaluations.json", ".lock"
+#: Options of the command line that a resumed run goes on with, and their smallest values.
+KEPT_OPTIONS = {"save_freq": None, "eval_freq": None, "eval_episodes": 1, "log_interval": 1}
 
 
 def create_run(log_folder: str | Path, config: RunConfig, arguments: Mapping[str, Any]) -> Path:
@@ -43,10 +51,63 @@ def create_run(log_folder: str | Path, config: RunConfig, arguments: Mapping[str
             number += 1
     packages = ("sb3-progpolicy", "torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy")
     versions = {"python": platform.python_version(), **{package: _version(package) for package in packages}}
-    described = {CONFIG: asdict(config), ARGUMENTS: dict(arguments), VERSIONS: versions}
-    for file, content in described.items():
-        write_atomically(folder / file, yaml.safe_dump(content, sort_keys=False))
+    write_atomically(folder / VERSIONS, yaml.safe_dump(versions, sort_keys=False))
+    describe_run(folder, config, arguments)
     return folder
+
+
+def describe_run(folder: Path, config: RunConfig, arguments: Mapping[str, Any]) -> None:
+    """Write a run's options and configuration; the configuration, which makes it a run folder, comes last.
+
+    :param folder: of the run
+    :param config: what is run
+    :param arguments: the command line's options
+    """
+    for file, content in {ARGUMENTS: dict(arguments), CONFIG: asdict(config)}.items():
+        write_atomically(folder / file, yaml.safe_dump(content, sort_keys=False))
+
+
+def read_arguments(folder: str | Path) -> dict[str, Any]:
+    """Return the command line's options that a run was started with, or last resumed with.
+
+    :param folder: of the run
+    :raises ValueError: if the file is damaged
+    """
+    path = Path(folder) / ARGUMENTS
+    if not path.is_file():
+        return {}
+    try:
+        arguments = read_yaml(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} does not hold options: it {error}") from None
+    if not isinstance(arguments, dict):
+        raise ValueError(f"{path} does not hold options: it is not a mapping")
+    for name, least in KEPT_OPTIONS.items():
+        value = arguments.get(name, least or 0)
+        if isinstance(value, bool) or not isinstance(value, int) or (least is not None and value < least):
+            raise ValueError(f"{path}: {name}={shortened(value)} is not accepted; it is a whole number")
+    for name in ("trained_agent", "tensorboard_log"):
+        if not isinstance(arguments.get(name, ""), str):
+            raise ValueError(f"{path}: {name}={shortened(arguments[name])} is not accepted; it is a text")
+    return arguments
+
+
+@contextlib.contextmanager
+def locked(folder: str | Path) -> Iterator[None]:
+    """Keep other processes from training in a run folder; the lock ends with this process, however that ends.
+
+    :param folder: of the run
+    :raises ValueError: if another process has it
+    """
+    lock = FileLock(Path(folder) / LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise ValueError(f"{folder} is in use: another process trains in it") from None
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def _version(package: str) -> str:
@@ -76,25 +137,57 @@ def read_config(folder: str | Path) -> RunConfig:
         raise ValueError(f"{path} does not describe a run: {error}") from None
 
 
-def load_model(path: str | Path, env: VecEnv | None = None, **kwargs: Any) -> OnPolicyAlgorithm:
+def load_model(
+    path: str | Path, env: VecEnv | None = None, allow_pickle: bool = False, **kwargs: Any
+) -> OnPolicyAlgorithm:
     """Load a model saved by any of our algorithms: the one that the configuration next to it names, or ReptilePPO.
 
-    :param path: a ``.zip`` file; as SB3's models it holds pickled objects, so load only files that you trust
+    :param path: a ``.zip`` file
     :param env: environments to go on training in
+    :param allow_pickle: load a file that holds pickled objects, as those of stock algorithms do. That runs whatever
+        code is in it, so do it only with files that you trust
     :param kwargs: see SB3's ``BaseAlgorithm.load``
-    :raises ValueError: if there is no such file
+    :raises ValueError: if there is no such file, or it holds pickled objects and they are not allowed
     """
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"{path} does not exist; a model is a .zip file")
-    algo = read_config(path.parent).algo if (path.parent / CONFIG).is_file() else "reptile_ppo"
-    return get_method(algo).algorithm.load(path, env=env, **kwargs)
+    method = get_method(read_config(path.parent).algo if (path.parent / CONFIG).is_file() else "reptile_ppo")
+    if "allow_pickle" in inspect.signature(method.algorithm.load).parameters:
+        kwargs["allow_pickle"] = allow_pickle
+    elif not method.has_reptile and not allow_pickle:
+        raise ValueError(
+            f"{path} is a model of {method.algorithm.__name__}, which is saved with pickle: loading it runs the code "
+            "in it. If you trust the file, give --allow-pickle"
+        )
+    return method.algorithm.load(path, env=env, **kwargs)
+
+
+def timesteps_of(path: Path) -> int | None:
+    """Return the environment steps that a saved model has been trained for, read without unpickling anything.
+
+    :param path: a ``.zip`` file
+    :return: ``None`` if it does not say
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            name = "model.json" if "model.json" in archive.namelist() else "data"  # "data" is SB3's
+            with archive.open(name) as file:
+                document = json.loads(file.read(2**24))
+        return int(document.get("state", document)["num_timesteps"])
+    except (OSError, zipfile.BadZipFile, ValueError, LookupError, TypeError, AttributeError, RuntimeError):
+        return None
 
 
 def save_results(folder: Path, model: OnPolicyAlgorithm) -> None:
-    """Write the model and, if it is one, its program to a run folder."""
+    """Write the model and, if it is one, its program to a run folder.
+
+    A reader finds out whether a process was killed between the two: both tell their number of steps.
+    """
     buffer = io.BytesIO()
     model.save(buffer)
-    write_atomically(folder / MODEL, buffer.getvalue())
-    if holds_program(model):
-        extract_program(model, env=read_config(folder).env).save(folder / PROGRAM)
+    program = extract_program(model, env=read_config(folder).env) if holds_program(model) else None
+    with uninterrupted():
+        write_atomically(folder / MODEL, buffer.getvalue())
+        if program is not None:
+            program.save(folder / PROGRAM)

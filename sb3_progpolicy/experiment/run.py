@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import signal
 import sys
+import threading
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,16 +19,26 @@ from stable_baselines3.common.vec_env import VecEnv
 from progpolicy_envs import DOMAINS
 from sb3_progpolicy.evaluation import evaluate_model, evaluate_program
 from sb3_progpolicy.experiment.config import REPTILE, RunConfig, check_surroundings, parse_schedule
-from sb3_progpolicy.experiment.folder import EVALUATIONS, MODEL, load_model, read_config, save_results
+from sb3_progpolicy.experiment.folder import (
+    EVALUATIONS,
+    MODEL,
+    PROGRAM,
+    load_model,
+    read_arguments,
+    read_config,
+    save_results,
+)
 from sb3_progpolicy.experiment.methods import METHODS
 from sb3_progpolicy.extraction import extract_program, holds_program
 from sb3_progpolicy.interaction import VecInteractionHistory
 from sb3_progpolicy.programs.files import write_atomically
+from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.reptile.callback import ReptileWrapper
 from sb3_progpolicy.reptile.checkpoint import ReptileCheckpoint, load_last_good
 from sb3_progpolicy.reptile.tasks import TaskDistribution, default_tasks
 from sb3_progpolicy.reptile_ppo.environments import DEFAULT_N_ENVS
 from sb3_progpolicy.vec_env import make_fast_vec_env
+from sb3_progpolicy.vec_env.worker import WorkerDiedError, interrupts_deferred
 
 
 def build_model(
@@ -97,11 +110,53 @@ class Interrupted(Exception):
 
     :param timesteps: environment steps at which it goes on
     :param resumable: whether it can go on as if nothing had happened
+    :param reason: what interrupted it, if that was not the user
     """
 
-    def __init__(self, timesteps: int, resumable: bool) -> None:
-        super().__init__(f"interrupted at step {timesteps}")
-        self.timesteps, self.resumable = timesteps, resumable
+    def __init__(self, timesteps: int, resumable: bool, reason: str = "") -> None:
+        super().__init__(reason or f"interrupted at step {timesteps}")
+        self.timesteps, self.resumable, self.reason = timesteps, resumable, reason
+
+
+class _RunCheckpoint(ReptileCheckpoint):
+    """Checkpoints of a run: the model and, if it is one, its program, of the same boundary.
+
+    :param folder: of the run
+    :param config: of the run
+    :param save_freq: environment steps between two checkpoints; negative for none but at an interruption
+    """
+
+    def __init__(self, folder: Path, config: RunConfig, save_freq: int) -> None:
+        super().__init__(folder / MODEL, save_freq if save_freq >= 0 else sys.maxsize)
+        self.config = config
+        self.timesteps = 0
+        self._program: Program | None = None
+
+    def _on_rollout_start(self) -> None:
+        if self.model.meta_iteration != self._boundary_iteration:
+            self.timesteps = self.num_timesteps
+            self._program = extract_program(self.model, env=self.config.env) if holds_program(self.model) else None
+        super()._on_rollout_start()
+
+    def save(self) -> bool:
+        with interrupts_deferred():
+            saved = super().save()
+            if saved and self._program is not None:
+                self._program.save(self.path.with_name(PROGRAM))
+        return saved
+
+
+@contextlib.contextmanager
+def terminable() -> Iterator[None]:
+    """Let a request to terminate (SIGTERM) end what is done here as Ctrl-C does."""
+    if threading.current_thread() is not threading.main_thread():  # only the main thread hears of signals
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def train(
@@ -118,19 +173,18 @@ def train(
     :param folder: of the run
     :param wrapper: from :func:`build_model`
     :param options: what to do besides
-    :raises Interrupted: after an interrupt signal (Ctrl-C) or a termination signal, when all is saved
+    :raises Interrupted: after an interrupt (Ctrl-C), or when a worker process has died; then all is saved
     """
-    checkpoint = None
+    checkpoint: _RunCheckpoint | None = None
     callbacks: list[BaseCallback] = [] if wrapper is None else [wrapper]
     if METHODS[config.algo].has_reptile:
-        checkpoint = ReptileCheckpoint(folder / MODEL, options.save_freq if options.save_freq >= 0 else sys.maxsize)
+        checkpoint = _RunCheckpoint(folder, config, options.save_freq)
         callbacks.append(checkpoint)
     if options.eval_freq >= 0:
         callbacks.append(_EvaluateVariations(config, options, folder / EVALUATIONS, wrapper))
     remaining = config.n_timesteps - model.num_timesteps
     if remaining <= 0:
         raise ValueError(f"{folder} is trained already: {model.num_timesteps} of {config.n_timesteps} steps")
-    terminate = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         model.learn(
             remaining,
@@ -140,24 +194,34 @@ def train(
             progress_bar=options.progress,
         )
     except KeyboardInterrupt:
-        if checkpoint is None or not checkpoint.save():
-            save_results(folder, model)
-            raise Interrupted(model.num_timesteps, resumable=False) from None
-        boundary = load_model(folder / MODEL)
-        save_results(folder, boundary)
-        raise Interrupted(boundary.num_timesteps, resumable=True) from None
-    finally:
-        signal.signal(signal.SIGTERM, terminate)
+        raise _saved(model, folder, checkpoint) from None
+    except WorkerDiedError as error:
+        raise _saved(model, folder, checkpoint, str(error)) from None
     save_results(folder, model)
 
 
-def resume(folder: Path, n_timesteps: int | None = None, verbose: int = 0) -> tuple[OnPolicyAlgorithm, RunConfig]:
-    """Load a run to go on from its last checkpoint; :func:`train` then ends as if it had never stopped.
+def _saved(model: OnPolicyAlgorithm, folder: Path, checkpoint: _RunCheckpoint | None, reason: str = "") -> Interrupted:
+    """Save what was reached and return what says so."""
+    with interrupts_deferred():
+        if checkpoint is not None:
+            checkpoint.save()
+            return Interrupted(checkpoint.timesteps, resumable=True, reason=reason)
+        save_results(folder, model)
+    return Interrupted(model.num_timesteps, resumable=False, reason=reason)
+
+
+def resume(
+    folder: Path, n_timesteps: int | None = None, verbose: int = 0, allow_pickle: bool = False
+) -> tuple[OnPolicyAlgorithm, RunConfig]:
+    """Load a run to go on from its last checkpoint, or make its model anew if it was stopped before the first.
+
+    :func:`train` then ends as if the run had never stopped.
 
     :param folder: of a run whose method has Reptile built in
     :param n_timesteps: another end of the training than the run was started with; schedules stretch to it
     :param verbose: 0, 1 or 2
-    :raises ValueError: if the folder holds no such run or no checkpoint
+    :param allow_pickle: see :func:`~sb3_progpolicy.experiment.folder.load_model`
+    :raises ValueError: if the folder holds no such run
     """
     config = read_config(folder)
     if not METHODS[config.algo].has_reptile:
@@ -167,21 +231,27 @@ def resume(folder: Path, n_timesteps: int | None = None, verbose: int = 0) -> tu
     if n_timesteps is not None:
         config = replace(config, hyperparams={**config.hyperparams, "n_timesteps": n_timesteps})
     if not (folder / MODEL).is_file():
-        raise ValueError(f"{folder} has no checkpoint yet; start the training anew")
-    model = load_last_good(folder / MODEL, load_model, env=make_env(config), device=config.device)
+        arguments = read_arguments(folder)
+        model, _ = build_model(config, arguments.get("tensorboard_log") or None, verbose)
+        if arguments.get("trained_agent"):
+            start_from(model, arguments["trained_agent"], allow_pickle or arguments.get("allow_pickle") is True)
+        return model, config
+    kwargs = {"env": make_env(config), "device": config.device, "allow_pickle": allow_pickle}
+    model = load_last_good(folder / MODEL, load_model, **kwargs)
     model.verbose = verbose
     return model, config
 
 
-def start_from(model: OnPolicyAlgorithm, trained: str | Path) -> None:
+def start_from(model: OnPolicyAlgorithm, trained: str | Path, allow_pickle: bool = False) -> None:
     """Take the parameters of a trained model as the initial ones.
 
     :param model: a new model
     :param trained: a ``.zip`` file or a run folder
+    :param allow_pickle: see :func:`~sb3_progpolicy.experiment.folder.load_model`
     :raises ValueError: if the policies differ in shape
     """
     path = Path(trained) / MODEL if Path(trained).is_dir() else Path(trained)
-    state = load_model(path, device=model.device).policy.state_dict()
+    state = load_model(path, device=model.device, allow_pickle=allow_pickle).policy.state_dict()
     try:
         model.policy.load_state_dict(state)
     except RuntimeError:

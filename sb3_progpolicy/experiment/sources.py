@@ -32,19 +32,20 @@ class Source:
     env_kwargs: dict[str, Any]
 
 
-def find_source(name: str) -> Source:
+def find_source(name: str, allow_pickle: bool = False) -> Source:
     """Load a run folder, a program's ``.json``, a model's ``.zip`` or a pretrained program, in this order.
 
     :param name: a path or a name
+    :param allow_pickle: see :func:`~sb3_progpolicy.experiment.folder.load_model`
     :raises ValueError: if there is nothing of that name; the message names the nearest pretrained programs
     """
     path = Path(name)
     if path.is_dir():
-        return _from_run(path)
+        return _from_run(path, allow_pickle)
     if path.is_file() and path.suffix == ".json":
         return _from_program(name, load_program(path))
     if path.is_file() and path.suffix == ".zip":
-        return _from_model(path)
+        return _from_model(path, allow_pickle)
     if path.suffix in (".json", ".zip") or path.is_file():
         reason = "is neither a .json nor a .zip file" if path.is_file() else "does not exist"
         raise ValueError(f"{name} {reason}; give a run folder, a program (.json), a model (.zip) or a pretrained name")
@@ -60,24 +61,27 @@ def _from_program(name: str, program: Program, env_kwargs: dict[str, Any] | None
     return Source(name, env_id, program, None, env_kwargs or {})
 
 
-def _from_run(folder: Path) -> Source:
-    from sb3_progpolicy.experiment.folder import MODEL, PROGRAM, read_config
+def _from_run(folder: Path, allow_pickle: bool) -> Source:
+    """A run's program comes from its own file, or from the model if a process was killed between the two."""
+    from sb3_progpolicy.experiment.folder import MODEL, PROGRAM, read_config, timesteps_of
 
     config = read_config(folder)
     if (folder / PROGRAM).is_file():
-        return _from_program(str(folder), load_program(folder / PROGRAM), dict(config.env_kwargs))
+        program = load_program(folder / PROGRAM)
+        if timesteps_of(folder / MODEL) in (None, program.metadata.get("timesteps")):
+            return _from_program(str(folder), program, dict(config.env_kwargs))
     if not (folder / MODEL).is_file():
         raise ValueError(f"{folder} holds no model yet")
-    return _from_model(folder / MODEL)
+    return _from_model(folder / MODEL, allow_pickle)
 
 
-def _from_model(path: Path) -> Source:
+def _from_model(path: Path, allow_pickle: bool) -> Source:
     from sb3_progpolicy.experiment.folder import CONFIG, load_model, read_config
     from sb3_progpolicy.extraction import extract_program, holds_program
 
     config = read_config(path.parent) if (path.parent / CONFIG).is_file() else None
     try:
-        model = load_model(path, device="cpu")
+        model = load_model(path, device="cpu", allow_pickle=allow_pickle)
     except ValueError:
         raise
     except Exception as error:  # unpickling a damaged file may raise anything

@@ -12,7 +12,8 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> None
 
     :param path: the file to create or replace; its folder must exist
     :param content: bytes, or a text, which is written as UTF-8 with the line ends it has
-    :raises OSError: if the folder cannot be written to; an old file is then left as it was
+    :raises OSError: if it cannot be written, such as for want of space; it names the file, and an old one is left as
+        it was
     """
     target = Path(path)
     temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.tmp")
@@ -22,5 +23,8 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> None
             handle.flush()
             os.fsync(handle.fileno())
         os.replace(temporary, target)
+    except OSError as error:
+        error.filename, error.filename2 = str(target), None
+        raise
     finally:
         temporary.unlink(missing_ok=True)

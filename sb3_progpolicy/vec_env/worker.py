@@ -169,22 +169,24 @@ class WorkerPart:
 
 @contextlib.contextmanager
 def interrupts_deferred() -> Iterator[None]:
-    """Keep Ctrl-C to the end of the block, so that it cannot cut a message in two and make the connection useless.
+    """Keep Ctrl-C, and a request to terminate that a Python function handles, to the end of the block.
 
-    Ctrl-C raises its exception in the main thread only, and only if a Python function handles it.
+    So they cannot cut a message in two and make the connection useless. Only the main thread hears of signals.
     """
-    handler = signal.getsignal(signal.SIGINT)
-    if not callable(handler) or threading.current_thread() is not threading.main_thread():
-        yield
-        return
+    handlers: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        known = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        handlers = {number: handler for number, handler in known.items() if callable(handler)}
     interrupted: list[int] = []
     try:
-        signal.signal(signal.SIGINT, lambda number, _: interrupted.append(number))
+        for number in handlers:
+            signal.signal(number, lambda caught, _: interrupted.append(caught))
         yield
     finally:
-        signal.signal(signal.SIGINT, handler)
-    if interrupted:
-        signal.raise_signal(signal.SIGINT)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    for number in interrupted[:1]:
+        signal.raise_signal(number)
 
 
 class _PartEnv:
