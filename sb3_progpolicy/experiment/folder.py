@@ -24,7 +24,7 @@ from sb3_progpolicy.experiment.methods import get_method
 from sb3_progpolicy.extraction import extract_program, holds_program
 from sb3_progpolicy.hyperparams import read_yaml, shortened
 from sb3_progpolicy.programs.files import write_atomically
-from sb3_progpolicy.worker import uninterrupted
+from sb3_progpolicy.vec_env.worker import interrupts_deferred
 
 MODEL, PROGRAM, CONFIG, ARGUMENTS, VERSIONS = "model.zip", "program.json", "config.yml", "args.yml", "versions.yml"
 EVALUATIONS, LOCK = "evaluations.json", ".lock"
@@ -187,7 +187,7 @@ def save_results(folder: Path, model: OnPolicyAlgorithm) -> None:
     buffer = io.BytesIO()
     model.save(buffer)
     program = extract_program(model, env=read_config(folder).env) if holds_program(model) else None
-    with uninterrupted():
+    with interrupts_deferred():
         write_atomically(folder / MODEL, buffer.getvalue())
         if program is not None:
             program.save(folder / PROGRAM)
