@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pybullet
 
+from progpolicy_envs.panda.libraries import pybullet
 from progpolicy_envs.panda.scene import MAX_OBJECTS, Scene
 from progpolicy_envs.panda.shapes import visual_drum
 from progpolicy_envs.panda.tasks import Mark, Task

@@ -7,9 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-import pybullet
-import pybullet_data
-
+from progpolicy_envs.panda.libraries import pybullet, pybullet_data
 from progpolicy_envs.panda.robot import PandaRobot
 from progpolicy_envs.panda.shapes import bearing_box, drum_inertia, footed_drum, visual_drum
 
