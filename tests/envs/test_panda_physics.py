@@ -12,8 +12,9 @@ import pytest
 from progpolicy_envs import DOMAINS
 
 pybullet = pytest.importorskip("pybullet", reason="pybullet is not installed")
+from progpolicy_envs.panda.physics import BULLET_MARGIN, CONTROL_STEP, PANDA_GYM_PHYSICS, Physics  # noqa: E402
 from progpolicy_envs.panda.robot import arm_angles  # noqa: E402
-from progpolicy_envs.panda.scene import BULLET_MARGIN, CONTROL_STEP, PANDA_GYM_PHYSICS, Physics, Scene  # noqa: E402
+from progpolicy_envs.panda.scene import Scene  # noqa: E402
 from progpolicy_envs.panda.tasks import Push, Slide, Stack  # noqa: E402
 
 
