@@ -1,6 +1,7 @@
-"""A copy of an environment is an environment of its own in the same state."""
+"""A copy of an environment is an environment of its own in the same state; one that is dropped is freed."""
 
 import copy
+import gc
 import pickle
 from collections.abc import Callable
 from typing import Any
@@ -83,6 +84,18 @@ def test_copy_of_a_closed_environment_is_closed() -> None:
     env = make("PandaPush-v0", None)
     env.close()
     copy.deepcopy(env).close()
+
+
+@pytest.mark.parametrize("num_envs", [None, 2])
+def test_panda_environment_that_is_dropped_frees_its_worlds(num_envs: int | None) -> None:
+    pybullet = pytest.importorskip("pybullet", reason="pybullet is not installed")
+    env = make("PandaPush-v0", num_envs)
+    env.reset(seed=0)
+    clients = [single.scene.client for single in getattr(env.unwrapped, "envs", [env.unwrapped])]
+    assert all(pybullet.getConnectionInfo(client)["isConnected"] for client in clients)
+    del env
+    gc.collect()
+    assert not any(pybullet.getConnectionInfo(client)["isConnected"] for client in clients)
 
 
 def test_copy_of_an_environment_with_an_open_window_opens_another() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import weakref
 from collections.abc import Sequence
 from typing import Any
 
@@ -40,7 +41,7 @@ class Scene:
     All eight objects exist from the start, so that a reset only moves bodies; those that a variation does not use
     sleep far below the floor.
 
-    A deep or pickled copy has a world of its own, in which everything since
+    A scene that is dropped frees its world. A deep or pickled copy has a world of its own, in which everything since
     the last :meth:`place` is done again, so that it is in the same state to the last bit.
 
     :param table: size of the table
@@ -59,6 +60,8 @@ class Scene:
         self._visual = visual
         self._lifted = self.rest_height + LIFT_HEIGHT
         self.client = pybullet.connect(pybullet.DIRECT)
+        self._disconnect = weakref.finalize(self, pybullet.disconnect, self.client)
+        self._disconnect.atexit = False  # the end of the process frees it anyway
         self._build(visual)
         self._set_delicate(False)
         self._still_steps = [0] * MAX_OBJECTS
@@ -295,9 +298,8 @@ class Scene:
 
     def close(self) -> None:
         """Disconnect from PyBullet; a second call does nothing."""
-        if self.client >= 0:
-            pybullet.disconnect(self.client)
-            self.client = -1
+        self._disconnect()
+        self.client = -1
 
     def _move(self, body: int, position: Sequence[float]) -> None:
         pybullet.resetBasePositionAndOrientation(body, position, _UPRIGHT, self.client)
