@@ -5,6 +5,7 @@ import io
 import os
 import subprocess
 import sys
+from importlib.util import find_spec
 
 import gymnasium as gym
 import numpy as np
@@ -15,6 +16,7 @@ from progpolicy_envs import DOMAINS
 from sb3_progpolicy.cli import run
 from sb3_progpolicy.cli.play import action_keys
 
+needs_pybullet = pytest.mark.skipif(find_spec("pybullet") is None, reason="pybullet is not installed")
 PLANNING = [domain.id for domain in DOMAINS.values() if not domain.simulation]
 
 
@@ -113,6 +115,7 @@ def test_the_planner_of_every_planning_domain_is_rendered_to_its_goal(tmp_path, 
         assert f"{picture.n_frames - 1} steps" in message
 
 
+@needs_pybullet
 @pytest.mark.parametrize(("env_id", "size"), [("Stacking-v0", "n_plates=8"), ("PandaPush-v0", "n_objects=8")])
 def test_colours_of_small_things_survive_in_the_animation(tmp_path, env_id, size):
     file = tmp_path / "a.gif"
@@ -126,6 +129,7 @@ def test_colours_of_small_things_survive_in_the_animation(tmp_path, env_id, size
     assert np.abs(difference).max() <= 10
 
 
+@needs_pybullet
 @pytest.mark.parametrize(("actor", "cap"), [("--planner", "30"), ("--random", "3")])
 def test_panda_is_rendered(tmp_path, capsys, actor, cap):
     file = tmp_path / "panda.gif"
@@ -141,6 +145,7 @@ def test_the_planner_of_another_environment_is_refused(tmp_path, capsys):
     assert "--planner is not accepted for CartPole-v1" in capsys.readouterr().err
 
 
+@needs_pybullet
 def test_the_table_of_environments_lists_every_domain_with_ranges_and_both_sets(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "300")
     assert run(["envs"]) == 0
@@ -152,3 +157,13 @@ def test_the_table_of_environments_lists_every_domain_with_ranges_and_both_sets(
             sizes = ", ".join(dict.fromkeys(str(variation[domain.size]) for variation in part))
             assert f"{domain.size}: {sizes}" in row
         assert row.count(f"{domain.size}: ") == 3, "the range, what is trained on, what is unseen"
+
+
+def test_the_table_of_environments_says_what_the_panda_tasks_need_where_pybullet_is_missing():
+    code = "import sys; sys.modules['pybullet'] = None; from sb3_progpolicy.cli import main; main()"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "COLUMNS": "300"}
+    command = [sys.executable, "-c", code, "envs"]
+    out = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=60, check=True).stdout
+    rows = out.split("├")
+    assert sum('pip install "sb3-progpolicy[panda]"' in row for row in rows) == len(SIMULATIONS)
+    assert sum("an integer from" in row for row in rows) == len(PLANNING)

@@ -22,6 +22,12 @@ class Display:
         self._window: Any = None
         self._clock: Any = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {"fps": self.fps}  # a copy opens a window of its own
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state)  # type: ignore[misc]
+
     def show(self, frame: Frame) -> None:
         """Show a frame ``(height, width, 3)``.
 

@@ -11,6 +11,7 @@ from sb3_progpolicy.cli.streams import quiet_stdout
 def envs() -> None:
     """List the environments with their parameters, training variations and unseen variations."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     from progpolicy_envs import DOMAINS
@@ -19,11 +20,14 @@ def envs() -> None:
     for name in ("environment", "parameters", "trained on", "unseen"):
         table.add_column(name, overflow="fold")
     for domain in DOMAINS.values():
-        with quiet_stdout():
-            parameters = _parameters(domain.id)
+        try:
+            with quiet_stdout():
+                parameters = [f"{name}: {parameter.allowed}" for name, parameter in _parameters(domain.id).items()]
+        except ModuleNotFoundError as error:
+            parameters = [str(error)]
         table.add_row(
             domain.id,
-            "\n".join(f"{name}: {parameter.allowed}" for name, parameter in parameters.items()),
+            escape("\n".join(parameters)),
             _listed(domain.train),
             _listed(domain.unseen),
         )

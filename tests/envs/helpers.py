@@ -66,10 +66,20 @@ def assert_picture_shows_the_state(env: gym.Env[Any, Any], action: int) -> None:
     assert (before != env.render()).any()
 
 
-def run_python(code: str, **environment: str) -> None:
-    """Run code in a process of its own; fail if it does."""
+def run_python(code: str, **environment: str) -> str:
+    """Run code in a process of its own; fail if it does; return what it writes."""
     variables = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **environment}
-    subprocess.run([sys.executable, "-c", code], check=True, env=variables, timeout=60)
+    result = subprocess.run(
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=variables,
+        timeout=60,
+        check=False,
+    )
+    assert result.returncode == 0, result.stdout
+    return result.stdout
 
 
 def assert_window_opens_shows_and_closes(env_id: str) -> None:

@@ -9,7 +9,6 @@ from itertools import islice, repeat
 
 import gymnasium as gym
 import numpy as np
-import pybullet
 import pytest
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
@@ -18,8 +17,10 @@ from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from progpolicy_envs import DOMAINS
-from progpolicy_envs.panda import PandaPushEnv, PandaPushGoalEnv, make_push
-from progpolicy_envs.panda.tasks import Slide
+
+pybullet = pytest.importorskip("pybullet", reason="pybullet is not installed")
+from progpolicy_envs.panda import PandaPushEnv, PandaPushGoalEnv, make_push  # noqa: E402
+from progpolicy_envs.panda.tasks import Slide  # noqa: E402
 
 IDS = [domain.id for domain in DOMAINS.values() if domain.simulation]
 OBJECT_IDS = [env_id for env_id in IDS if DOMAINS[env_id].size == "n_objects"]

@@ -7,13 +7,15 @@ from itertools import islice
 
 import gymnasium as gym
 import numpy as np
-import pybullet
 import pytest
 
 from progpolicy_envs import DOMAINS
-from progpolicy_envs.panda.robot import arm_angles
-from progpolicy_envs.panda.scene import BULLET_MARGIN, CONTROL_STEP, PANDA_GYM_PHYSICS, Physics, Scene
-from progpolicy_envs.panda.tasks import Push, Slide, Stack
+
+pybullet = pytest.importorskip("pybullet", reason="pybullet is not installed")
+from progpolicy_envs.panda.physics import BULLET_MARGIN, CONTROL_STEP, PANDA_GYM_PHYSICS, Physics  # noqa: E402
+from progpolicy_envs.panda.robot import arm_angles  # noqa: E402
+from progpolicy_envs.panda.scene import Scene  # noqa: E402
+from progpolicy_envs.panda.tasks import Push, Slide, Stack  # noqa: E402
 
 
 def gripper_with(scene: Scene, angles: list[float]) -> tuple[np.ndarray, np.ndarray]:

@@ -4,7 +4,10 @@ import os
 import re
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
+
+import pytest
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 SCRIPT = BENCHMARKS / "envs_speed.py"
@@ -18,6 +21,7 @@ def test_speed_script_prints_a_row_for_every_planning_domain() -> None:
     assert rows == ["Hanoi-v0", "Hiking-v0", "HikingEgo-v0", "Stacking-v0"]
 
 
+@pytest.mark.skipif(find_spec("pybullet") is None, reason="pybullet is not installed")
 def test_panda_speed_script_does_without_panda_gym_and_says_so() -> None:
     script = str(BENCHMARKS / "panda_speed.py")
     # A module that is None in sys.modules can't be imported, as if it were not installed.

@@ -8,7 +8,7 @@ from typing import ClassVar
 from progpolicy_envs.documentation import with_sections
 from progpolicy_envs.panda.env import Action, FlatObservation, PandaEnv
 from progpolicy_envs.panda.goal import EntryPoint, PandaGoalEnv
-from progpolicy_envs.panda.scene import MAX_OBJECTS, PANDA_GYM_PHYSICS, Physics
+from progpolicy_envs.panda.physics import MAX_OBJECTS, PANDA_GYM_PHYSICS, Physics
 from progpolicy_envs.panda.sections import SECTIONS
 from progpolicy_envs.panda.tasks import Push, Reach, Slide, Stack, Task
 from progpolicy_envs.planners import panda as controllers

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pybullet
 
-from progpolicy_envs.panda.scene import MAX_OBJECTS, Scene
+from progpolicy_envs.panda.libraries import pybullet
+from progpolicy_envs.panda.physics import MAX_OBJECTS
+from progpolicy_envs.panda.scene import Scene
 from progpolicy_envs.panda.shapes import visual_drum
 from progpolicy_envs.panda.tasks import Mark, Task
 from progpolicy_envs.rendering import Frame
@@ -52,6 +53,12 @@ class Camera:
         self._pins = [self._pin() for _ in range(2)]
         self._floor = self._ghost(pybullet.GEOM_BOX, [0.55, 0.6, 0.64, 1.0], halfExtents=[3, 3, 0.01])
         self._put(self._floor, (0.0, 0.0, -0.42))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"scene": self.scene, "task": self.task}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state)  # type: ignore[misc]
 
     def frame(self, focus: int) -> Frame:
         """Return a picture ``(360, 480, 3)`` of bytes.

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from progpolicy_envs.panda.camera import Camera
 from progpolicy_envs.panda.focus import ACTION_NAMES, BOUND, OBSERVATION_NAMES, focus_observation
-from progpolicy_envs.panda.scene import CONTROL_STEP, ObjectState, Physics, Scene
+from progpolicy_envs.panda.physics import CONTROL_STEP, ObjectState, Physics
+from progpolicy_envs.panda.scene import Scene
 from progpolicy_envs.panda.tasks import Task
 from progpolicy_envs.rendering import Display
 from progpolicy_envs.variation import VariationSpace
@@ -110,7 +111,7 @@ class PandaEnv(gym.Env[Any, Action]):
         numbers = action.tolist()
         if action.shape != (len(ACTION_NAMES),) or not all(map(math.isfinite, numbers)):
             raise ValueError(f"action={action!r} is not accepted; an action is 4 finite numbers from -1 to 1")
-        self.scene.robot.act(numbers)
+        self.scene.act(numbers)
         self.scene.simulate()
         observation, reward, info = self.post_physics_step()
         self._show()

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from progpolicy_envs.panda.physics import MAX_OBJECTS, ObjectState, Point
 from progpolicy_envs.panda.robot import PandaRobot
-from progpolicy_envs.panda.scene import MAX_OBJECTS, ObjectState, Point
 
 FEATURE_NAMES = (
     *("gripper_x", "gripper_y", "gripper_z"),

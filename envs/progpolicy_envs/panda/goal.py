@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium_robotics.core import GoalEnv
 from numpy.typing import NDArray
 
 from progpolicy_envs.panda.env import PROGRESS, Observation, PandaEnv, bounded_box, check_choice
 from progpolicy_envs.panda.focus import ACHIEVED_NAMES, DESIRED_NAMES, FEATURE_NAMES
+from progpolicy_envs.panda.libraries import GoalEnv
 
 _PARTS = (len(FEATURE_NAMES), len(FEATURE_NAMES) + len(ACHIEVED_NAMES))
 

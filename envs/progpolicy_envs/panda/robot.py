@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import pybullet
+from progpolicy_envs.panda.libraries import pybullet
 
 BASE_POSITION = (-0.6, 0.0, 0.0)
 #: Largest displacement of the gripper that one action asks for, metres.

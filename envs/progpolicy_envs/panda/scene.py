@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import math
+import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
-import pybullet
-import pybullet_data
-
+from progpolicy_envs.panda.history import History
+from progpolicy_envs.panda.libraries import pybullet, pybullet_data
+from progpolicy_envs.panda.physics import (
+    BULLET_MARGIN,
+    MAX_OBJECTS,
+    ObjectKind,
+    ObjectState,
+    Physics,
+    Point,
+    Table,
+)
 from progpolicy_envs.panda.robot import PandaRobot
 from progpolicy_envs.panda.shapes import bearing_box, drum_inertia, footed_drum, visual_drum
 
-MAX_OBJECTS = 8
-#: Seconds of one control step.
-CONTROL_STEP = 1 / 30
 TABLE_HEIGHT = 0.4
 #: An object whose centre is this near to the point between the fingertips may be held, metres.
 HOLD_DISTANCE = 0.03
@@ -25,116 +30,9 @@ LIFT_HEIGHT = 0.005
 STILL_MOTION, STILL_STEPS = 1e-5, 3
 #: An object whose centre is this far below the table's top has left the table, metres.
 FALL_DEPTH = 0.05
-#: By how much Bullet enlarges all bodies to find those that may touch, metres.
-BULLET_MARGIN = 0.02
-
-Point = tuple[float, float, float]
 
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 _STILL = (0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True)
-class Physics:
-    """How finely the world is simulated.
-
-    Coarse steps with few iterations of the contact solver are good enough for pushing objects over the table. But with
-    them a block slips out of the fingers when it is lifted, and a tower trembles until it falls. So the world is called
-    delicate while an object is between the fingers or off the table, and then has finer steps with more iterations.
-
-    :param frequency: physics steps per second
-    :param substeps: physics steps in one control step, which therefore takes ``substeps / frequency`` seconds
-    :param solver_iterations: iterations of the contact solver in each physics step
-    :param delicate_substeps: physics steps in one control step while the world is delicate
-    :param delicate_iterations: iterations of the contact solver while the world is delicate
-    :param sleeping: whether bodies at rest are left out of the simulation until something touches them; an object
-        is put to sleep after a tenth of a second of rest, where Bullet would wait two seconds
-    :param contact_margin: by how much all bodies are enlarged to find those that may touch, metres, while the world is
-        not delicate; with a small margin more of the objects near the hand can sleep
-    :param stock_bodies: whether table and objects are PyBullet's default, as in panda-gym: multibodies, each a box or a
-        cylinder. Otherwise the table, and every object whose kind does not ask for a multibody, are rigid bodies, with
-        shapes that do not sink in when they slide
-    """
-
-    frequency: int = 120
-    substeps: int = 4
-    solver_iterations: int = 10
-    delicate_substeps: int = 8
-    delicate_iterations: int = 60
-    sleeping: bool = True
-    contact_margin: float = 0.005
-    stock_bodies: bool = False
-
-    @property
-    def control_step(self) -> float:
-        """Seconds of one control step."""
-        return self.substeps / self.frequency
-
-
-#: panda-gym's settings, to compare with; its control step is 1/25 s.
-PANDA_GYM_PHYSICS = Physics(
-    frequency=500,
-    substeps=20,
-    solver_iterations=50,
-    delicate_substeps=20,
-    delicate_iterations=50,
-    sleeping=False,
-    contact_margin=BULLET_MARGIN,
-    stock_bodies=True,
-)
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table whose top is at height 0, symmetric about y = 0.
-
-    :param low_x: edge at the robot's side, metres
-    :param high_x: far edge, metres
-    :param width: extent along y, metres
-    """
-
-    low_x: float = -0.85
-    high_x: float = 0.25
-    width: float = 0.7
-
-
-@dataclass(frozen=True)
-class ObjectKind:
-    """What the objects of a task are.
-
-    :param shape: ``"box"`` or ``"cylinder"``
-    :param half_extents: half the size along x, y and z, metres; a cylinder's radius is the first
-    :param mass: kg
-    :param friction: lateral friction coefficient; PyBullet multiplies those of the two bodies in contact
-    :param multibody: whether PyBullet computes it as a multibody, which makes steadier towers, or as a plain rigid
-        body, whose contacts take less work to solve
-    """
-
-    shape: Literal["box", "cylinder"]
-    half_extents: tuple[float, float, float]
-    mass: float
-    friction: float
-    multibody: bool = False
-
-    @property
-    def height(self) -> float:
-        """Height of the centre of an object that lies on the table, metres."""
-        return self.half_extents[2]
-
-
-class ObjectState(NamedTuple):
-    """One object. All in metres, seconds and radians.
-
-    :param position: ``(3,)``
-    :param orientation: quaternion ``(4,)``, scalar last
-    :param velocity: ``(3,)``
-    :param spin: angular velocity ``(3,)``
-    """
-
-    position: Sequence[float]
-    orientation: Sequence[float]
-    velocity: Sequence[float]
-    spin: Sequence[float]
 
 
 class Scene:
@@ -142,6 +40,9 @@ class Scene:
 
     All eight objects exist from the start, so that a reset only moves bodies; those that a variation does not use
     sleep far below the floor.
+
+    A scene that is dropped frees its world. A deep or pickled copy has a world of its own, in which everything since
+    the last :meth:`place` is done again, so that it is in the same state to the last bit.
 
     :param table: size of the table
     :param kind: kind of the objects; ``None`` for a world without objects
@@ -156,8 +57,11 @@ class Scene:
         self.kind = kind
         self.physics = physics or Physics()
         self.n_objects = 0
+        self._visual = visual
         self._lifted = self.rest_height + LIFT_HEIGHT
         self.client = pybullet.connect(pybullet.DIRECT)
+        self._disconnect = weakref.finalize(self, pybullet.disconnect, self.client)
+        self._disconnect.atexit = False  # the end of the process frees it anyway
         self._build(visual)
         self._set_delicate(False)
         self._still_steps = [0] * MAX_OBJECTS
@@ -165,6 +69,16 @@ class Scene:
         self.positions: list[Point] = []
         self._used: list[int] = []
         self.place([])
+
+    def __getstate__(self) -> dict[str, Any]:
+        made_of = {"table": self.table, "kind": self.kind, "physics": self.physics, "visual": self._visual}
+        return {"made_of": made_of, "open": self.client >= 0, "history": self._history}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state["made_of"])  # type: ignore[misc]
+        state["history"].repeat(self)
+        if not state["open"]:
+            self.close()
 
     def _build(self, visual: bool) -> None:
         client = self.client
@@ -255,6 +169,7 @@ class Scene:
 
         :param positions: the centres of the objects, metres, no two overlapping
         """
+        self._history = History(tuple(positions))
         self._set_delicate(False)
         for index, body in enumerate(self.objects):
             self._move(body, _parking(index))
@@ -281,9 +196,15 @@ class Scene:
 
     def park(self, index: int) -> None:
         """Take an object off the table for the rest of the episode."""
+        self._history.park(index)
         body = self.objects[index]
         self._move(body, _parking(index))
         self._activate(body, pybullet.ACTIVATION_STATE_SLEEP)
+
+    def act(self, action: Sequence[float]) -> None:
+        """Set the motors for one action; see :meth:`PandaRobot.act`."""
+        self._history.pending = action
+        self.robot.act(action)
 
     def step(self) -> None:
         """Simulate one control step and read the state after it."""
@@ -292,6 +213,7 @@ class Scene:
 
     def simulate(self) -> None:
         """Compute the physics of one control step."""
+        self._history.end_step()
         step, set_engine, client = pybullet.stepSimulation, pybullet.setPhysicsEngineParameter, self.client
         other_margin = self._margin != BULLET_MARGIN
         # Bullet has one margin for the whole process, so it is set back at once for other worlds.
@@ -376,9 +298,8 @@ class Scene:
 
     def close(self) -> None:
         """Disconnect from PyBullet; a second call does nothing."""
-        if self.client >= 0:
-            pybullet.disconnect(self.client)
-            self.client = -1
+        self._disconnect()
+        self.client = -1
 
     def _move(self, body: int, position: Sequence[float]) -> None:
         pybullet.resetBasePositionAndOrientation(body, position, _UPRIGHT, self.client)

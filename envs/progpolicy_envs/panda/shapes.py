@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import pybullet
+from progpolicy_envs.panda.libraries import pybullet
 
 _SEGMENTS = 32
 #: How far a compound's only shape is off the centre, metres; PyBullet replaces a compound of one centred shape by that.

@@ -11,6 +11,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from progpolicy_envs.panda.physics import ObjectKind, Point, Table
 from progpolicy_envs.panda.placement import (
     Place,
     Points,
@@ -25,7 +26,7 @@ from progpolicy_envs.panda.placement import (
     sample_in_order,
 )
 from progpolicy_envs.panda.robot import BASE_POSITION
-from progpolicy_envs.panda.scene import FALL_DEPTH, ObjectKind, Point, Scene, Table
+from progpolicy_envs.panda.scene import FALL_DEPTH, Scene
 
 
 @dataclass(frozen=True)

@@ -85,7 +85,7 @@ class PandaVectorEnv(DomainVectorEnv):
 
     def _apply(self, actions: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.bool_], Infos]:
         for env, numbers in zip(self.envs, actions.tolist(), strict=True):
-            env.scene.robot.act(numbers)
+            env.scene.act(numbers)
         for env in self.envs:
             env.scene.simulate()
         observations, rewards, infos = zip(*[env.post_physics_step() for env in self.envs], strict=True)
