@@ -72,7 +72,7 @@ def read_config(folder: str | Path) -> RunConfig:
 def load_model(path: str | Path, env: VecEnv | None = None, **kwargs: Any) -> OnPolicyAlgorithm:
     """Load a model saved by any of our algorithms: the one that the configuration next to it names, or ReptilePPO.
 
-    :param path: a ``.zip`` file; as SB3's models it holds pickled objects, so load only files that you trust
+    :param path: a ``.zip`` file; those of stock algorithms hold pickles, so load only files that you trust
     :param env: environments to go on training in
     :param kwargs: see SB3's ``BaseAlgorithm.load``
     :raises ValueError: if there is no such file
