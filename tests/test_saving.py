@@ -237,6 +237,11 @@ def test_parameters_are_taken_from_a_file(file):
     assert all(th.equal(expected[name], actual[name]) for name in expected)
 
 
+def test_versions_are_printed_without_control_characters(file, capsys):
+    ReptilePPO.load(changed(file, lambda data: data["saved_with"].update(OS="\x1b[2J")), print_system_info=True)
+    assert capsys.readouterr().out.partition("SAVED MODEL")[2].startswith(" SYSTEM INFO ==\n- OS: \\x1b[2J\n- Python: ")
+
+
 @pytest.mark.parametrize(("force_reset", "kept"), [(True, False), (False, True)])
 def test_last_observation_is_kept_if_asked_for(force_reset, kept, file):
     loaded = ReptilePPO.load(file, env=make().get_env(), force_reset=force_reset)

@@ -14,7 +14,7 @@ from sb3_contrib.ppo_recurrent import MlpLstmPolicy
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
-from stable_baselines3.common.utils import FloatSchedule, get_system_info
+from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_progpolicy.extraction import env_id_of, extract_program, wrappers_of
 from sb3_progpolicy.interaction import program_names
@@ -27,7 +27,7 @@ from sb3_progpolicy.reptile.steps import MetaOptimizer, MetaOptimizerName, Task,
 from sb3_progpolicy.reptile.tasks import TaskDistribution, default_tasks
 from sb3_progpolicy.reptile_ppo.environments import make_venv, with_history
 from sb3_progpolicy.reptile_ppo.loading import load_model, parameters_of
-from sb3_progpolicy.reptile_ppo.saving import write_model
+from sb3_progpolicy.reptile_ppo.saving import print_versions, write_model
 from sb3_progpolicy.reptile_ppo.sequence_ppo import SequencePPO
 from sb3_progpolicy.reptile_ppo.theta import Theta
 
@@ -384,7 +384,7 @@ class ReptilePPO(SequencePPO):
         :raises ValueError: if the file is damaged, holds pickles, or something cannot be changed
         """
         if print_system_info:
-            get_system_info()
+            print_versions(path)
         return load_model(cls, path, env, device, custom_objects or {}, force_reset, allow_pickle, kwargs)
 
     def set_env(self, env: GymEnv | str, force_reset: bool = True) -> None:

@@ -292,6 +292,17 @@ def is_sb3_file(path: str | os.PathLike[str] | io.BufferedIOBase) -> bool:
     return "data" in _read_zip(path, only=())
 
 
+def print_versions(path: str | os.PathLike[str] | io.BufferedIOBase) -> None:
+    """Print the versions of libraries here, and those that a file was saved with, as SB3 does."""
+    print("== CURRENT SYSTEM INFO ==")
+    get_system_info()
+    entries = _read_zip(path, only=(DOCUMENT,))
+    if DOCUMENT in entries:
+        print("== SAVED MODEL SYSTEM INFO ==")
+        for name, text in _parse(entries[DOCUMENT])["saved_with"].items():
+            print(f"- {ascii(name)[1:-1]:.40}: {ascii(text)[1:-1]:.100}")  # a file may hold control characters
+
+
 def read_model(
     path: str | os.PathLike[str] | io.BufferedIOBase, allow_pickle: bool = False, replaced: Collection[str] = ()
 ) -> SavedModel:
@@ -363,8 +374,8 @@ def _parse(raw: bytes) -> dict[str, Any]:
         raise ModelFormatError(f'{DOCUMENT} does not say "format": "{FORMAT}"')
     if document.get("version") != VERSION:
         raise ModelFormatError(f"version {document.get('version')!r:.20} is not accepted; this release reads {VERSION}")
-    if not all(isinstance(document.get(part), dict) for part in ("arguments", "state", "optimizers")):
-        raise ModelFormatError(f"{DOCUMENT} lacks arguments, state or optimizers")
+    if not all(isinstance(document.get(part), dict) for part in ("saved_with", "arguments", "state", "optimizers")):
+        raise ModelFormatError(f"{DOCUMENT} lacks saved_with, arguments, state or optimizers")
     return document
 
 
