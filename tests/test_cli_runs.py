@@ -52,6 +52,14 @@ def options_of_training(monkeypatch):
     return given
 
 
+def test_resume_that_is_refused_leaves_the_run_as_it_was(tmp_path, capsys):
+    folder = train(tmp_path, "-n", "512")
+    before = (folder / "config.yml").read_bytes()
+    assert run(["train", "--resume", str(folder), "-n", "256"]) == 2
+    assert "trained already: 512 of 256 steps" in capsys.readouterr().err
+    assert (folder / "config.yml").read_bytes() == before
+
+
 def test_resume_keeps_what_it_was_given_for_the_next(tmp_path, options_of_training):
     folder = train(tmp_path, "-n", "512", "--save-freq", "100", "--eval-freq", "200", "--eval-episodes", "2")
     resume = ["train", "--resume", str(folder), "--verbose", "0"]

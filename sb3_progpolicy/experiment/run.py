@@ -182,12 +182,9 @@ def train(
         callbacks.append(checkpoint)
     if options.eval_freq >= 0:
         callbacks.append(_EvaluateVariations(config, options, folder / EVALUATIONS, wrapper))
-    remaining = config.n_timesteps - model.num_timesteps
-    if remaining <= 0:
-        raise ValueError(f"{folder} is trained already: {model.num_timesteps} of {config.n_timesteps} steps")
     try:
         model.learn(
-            remaining,
+            config.n_timesteps - model.num_timesteps,
             callback=callbacks,
             log_interval=options.log_interval,
             reset_num_timesteps=model.num_timesteps == 0,
@@ -223,7 +220,7 @@ def resume(
     :param n_timesteps: another end of the training than the run was started with; schedules stretch to it
     :param verbose: 0, 1 or 2
     :param allow_pickle: see :func:`~sb3_progpolicy.experiment.folder.load_model`
-    :raises ValueError: if the folder holds no such run
+    :raises ValueError: if the folder holds no such run, or it is trained already
     """
     config = read_config(folder)
     if not METHODS[config.algo].has_reptile:
@@ -239,6 +236,8 @@ def resume(
             start_from(model, arguments["trained_agent"], allow_pickle or arguments.get("allow_pickle") is True)
         return model, config
     model = load_model(folder / MODEL, env=make_env(config), device=config.device, allow_pickle=allow_pickle)
+    if model.num_timesteps >= config.n_timesteps:
+        raise ValueError(f"{folder} is trained already: {model.num_timesteps} of {config.n_timesteps} steps")
     model.verbose = verbose
     return model, config
 
