@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from itertools import groupby
 from typing import Any, cast
 
@@ -284,11 +287,15 @@ def _optimal_steps(venv: VecEnv) -> NDArray[np.float64]:
 def spec_of(env_id: str) -> Any:
     """Return the registered specification of an environment id.
 
+    :param env_id: an id, or ``module:id`` where a module registers it, which may be in the working directory
     :raises ValueError: if there is none; the message names the nearest ids
     """
+    module, _, name = env_id.rpartition(":")
+    if module:
+        _import(module)
     try:
-        return gym.spec(env_id)
-    except (gym.error.Error, ModuleNotFoundError):
+        return gym.spec(name)
+    except gym.error.Error:
         raise unknown("environment", env_id, gym.registry) from None
 
 
@@ -299,3 +306,14 @@ def _as_json(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_as_json(item) for item in value]
     return value.tolist() if isinstance(value, (np.generic, np.ndarray)) else value
+
+
+def _import(module: str) -> None:
+    here = os.getcwd()
+    sys.path.append(here)
+    try:
+        import_module(module)
+    except Exception as error:  # a module may raise anything
+        raise ValueError(f"module {module!r} cannot be imported: {type(error).__name__}: {error}") from None
+    finally:
+        sys.path.remove(here)

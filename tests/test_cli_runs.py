@@ -52,6 +52,14 @@ def options_of_training(monkeypatch):
     return given
 
 
+def test_resume_that_is_refused_leaves_the_run_as_it_was(tmp_path, capsys):
+    folder = train(tmp_path, "-n", "512")
+    before = (folder / "config.yml").read_bytes()
+    assert run(["train", "--resume", str(folder), "-n", "256"]) == 2
+    assert "trained already: 512 of 256 steps" in capsys.readouterr().err
+    assert (folder / "config.yml").read_bytes() == before
+
+
 def test_resume_keeps_what_it_was_given_for_the_next(tmp_path, options_of_training):
     folder = train(tmp_path, "-n", "512", "--save-freq", "100", "--eval-freq", "200", "--eval-episodes", "2")
     resume = ["train", "--resume", str(folder), "--verbose", "0"]
@@ -178,3 +186,38 @@ def test_full_disk_is_one_line_that_names_the_file(tmp_path, monkeypatch, capsys
     assert str(tmp_path / "a.txt") in said
     assert "No space left" in said
     assert not list(tmp_path.iterdir())
+
+
+OWN = """
+import gymnasium as gym
+from progpolicy_envs.hanoi import HanoiEnv
+
+class Own(HanoiEnv):
+    def __init__(self, n_discs=2, render_mode=None):
+        super().__init__(n_discs=n_discs, render_mode=render_mode)
+
+gym.register("Own-v0", entry_point=Own, max_episode_steps=50)
+"""
+
+
+def test_own_environment_of_a_module_in_the_working_directory(tmp_path, monkeypatch, capsys):
+    (tmp_path / "own_envs.py").write_text(OWN)
+    monkeypatch.chdir(tmp_path)
+    arguments = ["train", "--env", "own_envs:Own-v0", "-f", "runs", "-n", "128", *SMALL]
+    assert run([*arguments, "--env-kwargs", "n_disc:3"]) == 2
+    assert "nearest: n_discs" in capsys.readouterr().err
+    assert run([*arguments, "--env-kwargs", "n_discs:3"]) == 0
+    folder = "runs/reptile_ppo/Own-v0_1"
+    assert run(["evaluate", folder, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["env"] == "own_envs:Own-v0"
+    assert run(["evaluate", "Hanoi-v0", "--env", "own_envs:Own-v0"]) == 0
+    assert run(["train", "--resume", folder, "-n", "256", "--verbose", "0"]) == 0
+    assert run(["train", "--env", "own_env:Own-v0"]) == 2
+    assert "module 'own_env' cannot be imported" in capsys.readouterr().err
+
+
+def test_id_with_a_module_prefix_is_the_same_environment(tmp_path):
+    plain = train(tmp_path / "a", "-n", "128")
+    train(tmp_path / "c", "-n", "128", "--env", "progpolicy_envs:Hanoi-v0")
+    programs = [load_program(folder / "program.json") for folder in (plain, tmp_path / "c/reptile_ppo/Hanoi-v0_1")]
+    assert programs[0].controllers == programs[1].controllers

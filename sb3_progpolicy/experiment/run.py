@@ -182,12 +182,9 @@ def train(
         callbacks.append(checkpoint)
     if options.eval_freq >= 0:
         callbacks.append(_EvaluateVariations(config, options, folder / EVALUATIONS, wrapper))
-    remaining = config.n_timesteps - model.num_timesteps
-    if remaining <= 0:
-        raise ValueError(f"{folder} is trained already: {model.num_timesteps} of {config.n_timesteps} steps")
     try:
         model.learn(
-            remaining,
+            config.n_timesteps - model.num_timesteps,
             callback=callbacks,
             log_interval=options.log_interval,
             reset_num_timesteps=model.num_timesteps == 0,
@@ -221,7 +218,7 @@ def resume(
     :param n_timesteps: another end of the training than the run was started with; schedules stretch to it
     :param verbose: 0, 1 or 2
     :param allow_pickle: see :func:`~sb3_progpolicy.experiment.folder.load_model`
-    :raises ValueError: if the folder holds no such run
+    :raises ValueError: if the folder holds no such run, or it is trained already
     """
     config = read_config(folder)
     if not METHODS[config.algo].has_reptile:
@@ -238,6 +235,8 @@ def resume(
         return model, config
     kwargs = {"env": make_env(config), "device": config.device, "allow_pickle": allow_pickle}
     model = load_last_good(folder / MODEL, load_model, **kwargs)
+    if model.num_timesteps >= config.n_timesteps:
+        raise ValueError(f"{folder} is trained already: {model.num_timesteps} of {config.n_timesteps} steps")
     model.verbose = verbose
     return model, config
 

@@ -1,0 +1,55 @@
+"""rl-baselines3-zoo as a client: training with evaluation, then playing what was saved."""
+
+import subprocess
+import sys
+
+import pytest
+import yaml
+
+from sb3_progpolicy.experiment.methods import METHODS
+from sb3_progpolicy.hyperparams import load_entries
+from sb3_progpolicy.zoo import main, zoo_hyperparams
+
+OURS = [name for name, method in METHODS.items() if method.has_reptile]
+
+
+def zoo(*arguments):
+    command = [sys.executable, "-W", "ignore", "-m", "sb3_progpolicy.zoo", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_train_with_evaluation_and_enjoy(tmp_path):
+    pytest.importorskip("rl_zoo3")
+    run = ["--algo", "reptile_ppo", "--env", "Hanoi-v0", "-f", str(tmp_path)]
+    small = ["n_envs:4", "n_steps:16", "batch_size:16", "n_epochs:1", "temperature:'lin_1_0.5'"]
+    zoo("train", *run, "-n", "256", "--eval-freq", "128", "--eval-episodes", "1", "--seed", "1", "-params", *small)
+    folder = tmp_path / "reptile_ppo" / "Hanoi-v0_1"
+    assert {path.name for path in folder.glob("*.zip")} == {"best_model.zip", "Hanoi-v0.zip"}
+    assert "Mean reward" in zoo("enjoy", *run, "-n", "600", "--no-render")
+
+
+@pytest.mark.parametrize("algo", OURS)
+def test_hyperparameters_are_ours_in_values_that_the_zoo_accepts(algo):
+    ours, translated = load_entries(METHODS[algo].hyperparams), zoo_hyperparams(algo)
+    assert set(translated) == set(ours)
+    for env_id, entry in translated.items():
+        assert entry["interaction_history"] is False
+        assert set(entry) - set(ours[env_id]) <= {"env_wrapper", "interaction_history"}
+        assert all(entry[name] == value for name, value in ours[env_id].items() if name != "interaction_history")
+    assert yaml.safe_load(yaml.safe_dump(translated)) == translated
+
+
+def test_schedule_that_the_zoo_has_no_form_for_is_refused(monkeypatch):
+    entry = {"policy": "ProgPolicy", "n_timesteps": 1, "learning_rate": "lin_0.5_0.1"}
+    monkeypatch.setattr("sb3_progpolicy.zoo.load_entries", lambda _: {"default": entry})
+    with pytest.raises(ValueError, match=r"default: learning_rate='lin_0.5_0.1' has no form in the zoo"):
+        zoo_hyperparams("reptile_ppo")
+
+
+def test_algorithms_of_others_and_other_commands_are_refused():
+    with pytest.raises(ValueError, match="reptile_ppo"):
+        zoo_hyperparams("ppo")
+    with pytest.raises(SystemExit, match=r"train\|enjoy"):
+        main(["plot"])
