@@ -14,15 +14,17 @@ from numpy.typing import NDArray
 
 from progpolicy_envs.variation import Variation, VariationSpace
 
-Infos = dict[str, NDArray[Any]]
+Infos = dict[str, Any]
 
 
 class DomainVectorEnv(VectorEnv, ABC):
     """N environments of one task domain, reset within the step in which their episode ends.
 
-    Autoreset is ``SAME_STEP``: where an episode ends, the returned observation opens the next one and
-    ``infos["final_obs"][i]`` holds the last observation of the ended one, ``infos["is_success"][i]`` whether it
-    reached the goal. A variation is one value for all environments or a sequence of ``num_envs`` values.
+    Autoreset is ``SAME_STEP``: where an episode ends, the returned observation opens the next one, and ``infos`` have
+    the ended one in Gymnasium's form: ``infos["final_obs"][i]`` is its last observation and
+    ``infos["final_info"]["is_success"][i]`` says whether it reached the goal, where ``infos["_final_obs"][i]`` and
+    ``infos["_final_info"][i]`` are true. The other infos, such as ``infos["is_success"]``, are of the step itself. A
+    variation is one value for all environments or a sequence of ``num_envs`` values.
 
     :param num_envs: number of environments
     :param observation_space: of one environment
@@ -90,11 +92,10 @@ class DomainVectorEnv(VectorEnv, ABC):
         self._elapsed += 1
         truncated = (self._elapsed >= self.max_episode_steps) & ~terminated
         observations = self._observe()
-        (ended,) = (terminated | truncated).nonzero()
+        done = terminated | truncated
+        (ended,) = done.nonzero()
         if len(ended):
-            infos["final_obs"] = np.full(self.num_envs, None, dtype=object)
-            for row in ended:
-                infos["final_obs"][row] = _of_row(observations, int(row))
+            infos.update(_final(observations, infos, done, ended))
             self._elapsed[ended] = 0
             self._reset_rows(ended)
             observations = self._observe()
@@ -191,6 +192,15 @@ def check_num_envs(num_envs: int) -> None:
     """Raise ``ValueError`` for a number of environments below 1."""
     if num_envs < 1:
         raise ValueError(f"num_envs={num_envs} is not accepted; it is at least 1")
+
+
+def _final(observations: Any, infos: Infos, done: NDArray[np.bool_], ended: NDArray[np.intp]) -> Infos:
+    """Return the last observations and infos of the episodes that have ended; masks ``_name`` say which have."""
+    final_obs = np.full(len(done), None, dtype=object)
+    for row in ended:
+        final_obs[row] = _of_row(observations, int(row))
+    final_info = {**infos, **{f"_{name}": done for name in infos}}
+    return {"final_obs": final_obs, "_final_obs": done, "final_info": final_info, "_final_info": done}
 
 
 def _of_row(observations: Any, row: int) -> Any:

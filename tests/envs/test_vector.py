@@ -1,14 +1,15 @@
 """The batched form of every planning domain does what the single form does, step for step."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-import progpolicy_envs  # noqa: F401 (registers the ids)
+from progpolicy_envs import DOMAINS
 from progpolicy_envs.layouts import LAYOUTS
 
 Draw = Callable[[np.random.Generator, int], dict[str, Any]]
@@ -94,7 +95,9 @@ def compare_one_step(
         single_truncated = single_truncated and not single_terminated
         assert (rewards[row], terminated[row], truncated[row]) == (reward, single_terminated, single_truncated)
         assert infos["is_success"][row] == info["is_success"]
-        if single_terminated or single_truncated:
+        ended = single_terminated or single_truncated
+        assert bool(infos.get("_final_info", np.zeros(row + 1))[row]) == ended
+        if ended:
             np.testing.assert_array_equal(infos["final_obs"][row], observation)
             observation, _ = env.reset()
         np.testing.assert_array_equal(observations[row], observation)
@@ -169,3 +172,29 @@ def test_refused_variation_leaves_the_old_one_in_force() -> None:
         env.reset(options={"n_discs": [3, 13]})
     _, infos = env.reset()
     assert [variation["n_discs"] for variation in infos["variation"]] == [2, 2]
+
+
+@pytest.mark.parametrize("env_id", DOMAINS)
+def test_ended_episodes_are_told_in_the_form_of_gymnasium(env_id: str) -> None:
+    limited = partial(gym.make, env_id, max_episode_steps=5)
+    theirs = SyncVectorEnv([limited] * 3, autoreset_mode=AutoresetMode.SAME_STEP)
+    ours = make_vec(env_id, 3, max_episode_steps=5)
+    theirs.reset(seed=0)
+    ours.reset(seed=0)
+    ours.action_space.seed(0)
+    for step in range(1, 8):
+        actions = ours.action_space.sample()
+        (*_, expected), (*_, infos) = theirs.step(actions), ours.step(actions)
+        names = {name for name in expected if "final" in name}
+        assert {name for name in infos if "final" in name} == names
+        assert step != 5 or names == {"final_obs", "_final_obs", "final_info", "_final_info"}
+        if names:
+            np.testing.assert_array_equal(infos["_final_obs"], expected["_final_obs"])
+            np.testing.assert_array_equal(infos["_final_info"], expected["_final_info"])
+            for row in np.flatnonzero(infos["_final_info"]):
+                np.testing.assert_array_equal(infos["final_obs"][row], expected["final_obs"][row])
+                assert infos["final_info"].keys() == expected["final_info"].keys()
+                for name, values in infos["final_info"].items():
+                    assert tuple(np.ravel(values[row])) == tuple(np.ravel(expected["final_info"][name][row]))
+    theirs.close()
+    ours.close()
