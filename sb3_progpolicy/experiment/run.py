@@ -34,7 +34,7 @@ from sb3_progpolicy.interaction import VecInteractionHistory
 from sb3_progpolicy.programs.files import write_atomically
 from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.reptile.callback import ReptileWrapper
-from sb3_progpolicy.reptile.checkpoint import ReptileCheckpoint, load_last_good
+from sb3_progpolicy.reptile.checkpoint import ReptileCheckpoint, load_last_good, previous_of
 from sb3_progpolicy.reptile.tasks import TaskDistribution, default_tasks
 from sb3_progpolicy.reptile_ppo.environments import DEFAULT_N_ENVS
 from sb3_progpolicy.vec_env import make_fast_vec_env
@@ -227,7 +227,7 @@ def resume(
     check_surroundings(config)
     if n_timesteps is not None:
         config = replace(config, hyperparams={**config.hyperparams, "n_timesteps": n_timesteps})
-    if not (folder / MODEL).is_file():
+    if not (folder / MODEL).is_file() and not previous_of(folder / MODEL).is_file():
         arguments = read_arguments(folder)
         model, _ = build_model(config, arguments.get("tensorboard_log") or None, verbose)
         if arguments.get("trained_agent"):
