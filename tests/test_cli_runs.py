@@ -16,6 +16,7 @@ from sb3_progpolicy.experiment import run as runs
 from sb3_progpolicy.experiment.folder import locked, timesteps_of
 from sb3_progpolicy.experiment.sources import find_source
 from sb3_progpolicy.programs import load_program
+from sb3_progpolicy.vec_env import WorkerDiedError
 
 SMALL = ["--hyperparams", "n_envs:4", "n_steps:16", "batch_size:16", "n_epochs:1", "inner_updates:2", "--verbose", "0"]
 CALL = [sys.executable, "-c", "from sb3_progpolicy.cli import main; main()"]
@@ -165,7 +166,7 @@ def test_a_request_to_terminate_ends_training_at_any_moment(moment, tmp_path, mo
 def test_dead_worker_is_one_line_that_says_what_is_saved_and_how_to_go_on(tmp_path, monkeypatch, capsys):
     def dies(self, *_):
         if self.num_timesteps >= 300:
-            raise RuntimeError("worker 0, which ran environments 2 to 3, has died with exit code -9; all are closed")
+            raise WorkerDiedError("worker 0, which ran environments 2 to 3, has died with exit code -9; all are closed")
         return True
 
     monkeypatch.setattr(runs._RunCheckpoint, "_on_step", dies)
