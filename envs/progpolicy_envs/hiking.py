@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -50,7 +51,7 @@ _SECTIONS = {
         ## Description
         A map of 8 x 10 cells holds pathways, rocks and water. The hiker walks on pathways only, one cell a step. The
         task is done when the last of ``n_stars`` stars has been collected; a star is collected by stepping onto it.
-        The pathways of every map offered are tree-like: they bend, fork and end, and never close a ring.
+        The pathways of the named and the random maps are tree-like: they bend, fork and end, and never close a ring.
 
         ## Action Space
         ``Discrete(4)``: 0 north, 1 east, 2 south, 3 west.
@@ -76,10 +77,20 @@ _SECTIONS = {
         ``gym.make("$id", n_stars=5, layout="fork")`` or ``env.reset(options={"n_stars": 5})``; an option stays in
         force until it is changed. Values that are not accepted raise ``ValueError``.
 
-        | Parameter   | Values                                         | Default | Meaning         |
-        |-------------|------------------------------------------------|---------|-----------------|
-        | n_stars     | 1 to 12                                        | 3       | number of stars |
-        | layout      | valley, spiral, comb, fork, lakeside or random | valley  | the map         |
+        | Parameter   | Values                                                          | Default | Meaning         |
+        |-------------|-----------------------------------------------------------------|---------|-----------------|
+        | n_stars     | 1 to 12                                                         | 3       | number of stars |
+        | layout      | valley, spiral, comb, fork, lakeside, random or a map as a text | valley  | the map         |
+
+        A map of your own is a text with line feeds, or a sequence of rows: up to 8 rows of equal length, up to 10
+        characters. ``.`` is a pathway, ``#`` rock, ``~`` water, and ``H`` the start, of which there is one; beyond the
+        rows there is rock. Stars lie on cells marked ``*`` if there are any, else on any pathway cell.
+
+            gym.make("$id", n_stars=2, layout=\"\"\"
+                H...#
+                .##*#
+                *#~~~
+            \"\"\")
 
         ## References
         The domain `hiking` of PDDLGym (Silver and Chitnis, 2020).
@@ -134,7 +145,7 @@ class HikingEnv(_WholeMap, PathwayEnv):
     def __init__(
         self,
         n_stars: int = 3,
-        layout: str = "valley",
+        layout: str | Sequence[str] = "valley",
         render_mode: str | None = None,
         observation: None = None,
     ) -> None:
@@ -187,7 +198,7 @@ class HikingVectorEnv(_WholeMap, PathwayVectorEnv):
         self,
         num_envs: int = 1,
         n_stars: int = 3,
-        layout: str = "valley",
+        layout: str | Sequence[str] = "valley",
         max_episode_steps: int | None = None,
         observation: None = None,
     ) -> None:

@@ -1,7 +1,8 @@
-"""Maps of pathways for Hiking-v0: hand-drawn ones, and a seeded generator of connected random ones."""
+"""Maps of pathways for Hiking-v0: hand-drawn ones, a seeded generator of connected random ones, and those of users."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -13,7 +14,7 @@ N_CELLS = N_ROWS * N_COLUMNS
 N_RANDOM_LAYOUTS = 1024
 #: Row and column change of each direction, clockwise from north, so that the next index is the right-hand turn.
 DIRECTIONS = {"north": (-1, 0), "east": (0, 1), "south": (1, 0), "west": (0, -1)}
-PATH, ROCK, WATER, START = ".", "#", "~", "H"
+PATH, ROCK, WATER, START, STAR = ".", "#", "~", "H", "*"
 
 
 def _neighbours() -> NDArray[np.int64]:
@@ -32,7 +33,8 @@ _ADJACENT = [sorted(set(near) - {cell}) for cell, near in enumerate(NEIGHBOURS.t
 class Layout:
     """One map. Cells are numbered row by row from the north-west corner, 0 to 79.
 
-    :param rows: 8 texts of 10 characters: ``.`` pathway, ``#`` rock, ``~`` water, one ``H`` where the hiker starts
+    :param rows: 8 texts of 10 characters: ``.`` pathway, ``#`` rock, ``~`` water, one ``H`` where the hiker starts, and
+        perhaps ``*``, pathway cells where stars lie
     """
 
     rows: tuple[str, ...]
@@ -40,7 +42,7 @@ class Layout:
     @cached_property
     def is_path(self) -> NDArray[np.bool_]:
         """``(80,)``: where one can walk."""
-        return np.array([cell in (PATH, START) for cell in "".join(self.rows)])
+        return np.array([cell in (PATH, START, STAR) for cell in "".join(self.rows)])
 
     @cached_property
     def start(self) -> int:
@@ -49,7 +51,10 @@ class Layout:
 
     @cached_property
     def star_cells(self) -> NDArray[np.int64]:
-        """The cells where a star can lie: every pathway cell but the start."""
+        """The cells where a star can lie: those marked as such or, without marks, every pathway cell but the start."""
+        marked = [cell for cell, kind in enumerate("".join(self.rows)) if kind == STAR]
+        if marked:
+            return np.array(marked)
         return np.flatnonzero(self.is_path & (np.arange(N_CELLS) != self.start))
 
     @cached_property
@@ -133,6 +138,52 @@ LAYOUTS: dict[str, Layout] = {
         )
     ),
 }
+
+
+def split_rows(drawing: str | Sequence[str]) -> tuple[str, ...]:
+    """Return the rows of a map, without the blanks around them and without empty rows at both ends of a text.
+
+    :param drawing: rows, or one text with line feeds
+    """
+    rows = drawing.strip().splitlines() if isinstance(drawing, str) else drawing
+    return tuple(row.strip() for row in rows)
+
+
+@lru_cache(maxsize=256)
+def read_layout(rows: tuple[str, ...]) -> Layout:
+    """Return the map that rows of text draw; beyond them there is rock.
+
+    :param rows: up to 8 rows of equal length, up to 10: ``.`` pathway, ``#`` rock, ``~`` water, one ``H`` where the
+        hiker starts; stars lie on the cells marked ``*`` or, without any, on any pathway cell
+    :raises ValueError: if they draw no map, or one without stars that can be reached; the message names the cell
+    """
+    lengths = sorted({len(row) for row in rows})
+    if not 1 <= len(rows) <= N_ROWS or len(lengths) != 1 or not 1 <= lengths[0] <= N_COLUMNS:
+        raise ValueError(
+            f"a map of {len(rows)} rows of lengths {lengths} is not accepted; it has up to {N_ROWS} rows of equal "
+            f"length, up to {N_COLUMNS}"
+        )
+    for number, text in enumerate(rows):
+        for place, cell in enumerate(text):
+            if cell not in (PATH, ROCK, WATER, START, STAR):
+                raise ValueError(
+                    f"{cell!r} in row {number}, column {place} of a map is not accepted; a cell is '.' pathway, '#' "
+                    "rock, '~' water, 'H' start or '*' star"
+                )
+    if (n_starts := "".join(rows).count(START)) != 1:
+        raise ValueError(f"a map with {n_starts} starts is not accepted; it has one cell 'H'")
+    wide = [row.ljust(N_COLUMNS, ROCK) for row in rows]
+    layout = Layout((*wide, *[ROCK * N_COLUMNS] * (N_ROWS - len(wide))))
+    if not len(layout.star_cells):
+        raise ValueError("a map without a pathway cell beside the start is not accepted; there is no place for a star")
+    apart = layout.star_cells[layout.distances[layout.start, layout.star_cells] < 0]
+    if len(apart):
+        row, column = divmod(int(apart[0]), N_COLUMNS)
+        raise ValueError(
+            f"a map in which no way leads from the start to row {row}, column {column} is not accepted; stars may lie "
+            "there. Connect the pathways, or mark with '*' where stars may lie"
+        )
+    return layout
 
 
 @lru_cache(maxsize=N_RANDOM_LAYOUTS)

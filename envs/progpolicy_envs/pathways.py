@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,8 +18,13 @@ from progpolicy_envs.layouts import (
     N_COLUMNS,
     N_RANDOM_LAYOUTS,
     NEIGHBOURS,
+    PATH,
+    STAR,
+    START,
     Layout,
     random_layout,
+    read_layout,
+    split_rows,
 )
 from progpolicy_envs.planners import hiking as planner
 from progpolicy_envs.planning import PlanningEnv
@@ -27,9 +34,42 @@ from progpolicy_envs.vector import PlanningVectorEnv
 
 MAX_STARS = 12
 RANDOM = "random"
+
+
+def _are_rows(value: Any) -> bool:
+    return isinstance(value, Sequence) and all(isinstance(row, str) for row in value)
+
+
+@dataclass(frozen=True)
+class LayoutParameter(ChoiceParameter):
+    """The name of a map, or a map of the user's."""
+
+    @property
+    def allowed(self) -> str:
+        """The accepted values in words."""
+        return f"{super().allowed}, or a map as rows of text"
+
+    def parse(self, value: Any) -> str:
+        """Return the name, or the rows of the map joined by line feeds.
+
+        :param value: one of ``choices``, or rows as for :func:`~progpolicy_envs.layouts.read_layout`
+        :raises ValueError: if it is neither
+        """
+        # A text in one line is a name, unless it has a start.
+        is_map = START in value if isinstance(value, str) else _are_rows(value)
+        if not is_map:
+            return super().parse(value)
+        rows = split_rows(value)
+        try:
+            read_layout(rows)
+        except ValueError as error:
+            raise ValueError(f"{self.name}: {error}") from None
+        return "\n".join(rows)
+
+
 VARIATIONS = VariationSpace(
     IntParameter("n_stars", 1, MAX_STARS, "number of stars"),
-    ChoiceParameter("layout", (*LAYOUTS, RANDOM), "the map; 'random' draws another one for every episode"),
+    LayoutParameter("layout", (*LAYOUTS, RANDOM), "the map; 'random' draws another one for every episode"),
 )
 STEP_REWARD, ILLEGAL_REWARD, STAR_REWARD = -0.01, -0.05, 1.0
 
@@ -39,14 +79,32 @@ _OBSERVATION_SPACE = spaces.Box(-1.0, 1.0, (N_CELLS,), dtype=np.float32)
 _FIRST_LAYOUT = LAYOUTS["valley"]
 
 
+def named_layout(value: str) -> Layout:
+    """Return the map of a value of ``layout`` that is not random."""
+    return LAYOUTS[value] if value in LAYOUTS else read_layout(split_rows(value))
+
+
+def check_variation(variation: Variation) -> Variation:
+    """Return ``variation``.
+
+    :param variation: values of ``n_stars`` and ``layout``, each in its range
+    :raises ValueError: if the map has fewer places for stars than there are stars
+    """
+    n_stars, layout = variation["n_stars"], variation["layout"]
+    n_places = MAX_STARS if layout == RANDOM else len(named_layout(layout).star_cells)
+    if n_stars > n_places:
+        raise ValueError(f"n_stars={n_stars} is not accepted; on this layout n_stars is at most {n_places}")
+    return variation
+
+
 def draw_task(generator: np.random.Generator, variation: Variation) -> tuple[Layout, NDArray[np.int64]]:
     """Draw the map, where it is random, and the cells of the stars.
 
     :param generator: the environment's generator
     :param variation: values of ``n_stars`` and ``layout``
     """
-    name = variation["layout"]
-    layout = random_layout(int(generator.integers(N_RANDOM_LAYOUTS))) if name == RANDOM else LAYOUTS[name]
+    value = variation["layout"]
+    layout = random_layout(int(generator.integers(N_RANDOM_LAYOUTS))) if value == RANDOM else named_layout(value)
     return layout, generator.permutation(layout.star_cells)[: variation["n_stars"]]
 
 
@@ -78,9 +136,11 @@ class PathwayEnv(MapView, PlanningEnv):
     variations: ClassVar[VariationSpace] = VARIATIONS
     action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
 
-    def __init__(self, n_stars: int = 3, layout: str = "valley", render_mode: str | None = None) -> None:
+    def __init__(
+        self, n_stars: int = 3, layout: str | Sequence[str] = "valley", render_mode: str | None = None
+    ) -> None:
         super().__init__(render_mode)
-        self.variation = self.variations.update({}, {"n_stars": n_stars, "layout": layout})
+        self.variation = check_variation(self.variations.update({}, {"n_stars": n_stars, "layout": layout}))
         self.observation_space = _OBSERVATION_SPACE
         self.action_space = spaces.Discrete(len(ACTION_NAMES))
         self._set_layout(_FIRST_LAYOUT)
@@ -98,7 +158,7 @@ class PathwayEnv(MapView, PlanningEnv):
         :raises ValueError: if a variation is not accepted; the variation in force is then unchanged
         """
         super().reset(seed=seed)
-        self.variation = self.variations.update(self.variation, options)
+        self.variation = check_variation(self.variations.update(self.variation, options))
         layout, stars = draw_task(self.np_random, self.variation)
         self._set_layout(layout)
         self.hiker, self.stars = layout.start, set(stars.tolist())
@@ -160,10 +220,10 @@ class PathwayEnv(MapView, PlanningEnv):
         return [divmod(star, N_COLUMNS) for star in sorted(self.stars)]
 
     def _text(self) -> str:
-        rows = [list(row.replace("H", ".")) for row in self.layout.rows]
+        rows = [list(row.replace(START, PATH).replace(STAR, PATH)) for row in self.layout.rows]
         for row, column in self._star_cells():
-            rows[row][column] = "*"
-        rows[self.hiker // N_COLUMNS][self.hiker % N_COLUMNS] = "H"
+            rows[row][column] = STAR
+        rows[self.hiker // N_COLUMNS][self.hiker % N_COLUMNS] = START
         return "\n".join("".join(row) for row in rows) + "\n"
 
 
@@ -179,12 +239,17 @@ class PathwayVectorEnv(MapView, PlanningVectorEnv):
     """
 
     variations: ClassVar[VariationSpace] = VARIATIONS
+    check_variation = staticmethod(check_variation)
     action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
 
     def __init__(
-        self, num_envs: int = 1, n_stars: int = 3, layout: str = "valley", max_episode_steps: int | None = None
+        self,
+        num_envs: int = 1,
+        n_stars: int = 3,
+        layout: str | Sequence[str] = "valley",
+        max_episode_steps: int | None = None,
     ) -> None:
-        variation = self.variations.update({}, {"n_stars": n_stars, "layout": layout})
+        variation = check_variation(self.variations.update({}, {"n_stars": n_stars, "layout": layout}))
         super().__init__(num_envs, _OBSERVATION_SPACE, spaces.Discrete(len(ACTION_NAMES)), variation, max_episode_steps)
         self._numbers = np.full((num_envs, self.n_numbers), BLOCKED, dtype=np.float32)
         self._first_places = self._rows * self.n_numbers

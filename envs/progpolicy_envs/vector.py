@@ -136,7 +136,7 @@ class DomainVectorEnv(VectorEnv, ABC):
     def _set_variations(self, options: Mapping[str, Any]) -> None:
         per_row = [dict[str, Any]() for _ in range(self.num_envs)]
         for name, value in options.items():
-            values = [value] * self.num_envs if np.ndim(value) == 0 else list(value)
+            values = list(value) if _is_per_row(value) else [value] * self.num_envs
             if len(values) != self.num_envs:
                 raise ValueError(f"{name}: {len(values)} values given for {self.num_envs} environments")
             for row, row_value in enumerate(values):
@@ -186,6 +186,11 @@ class PlanningVectorEnv(DomainVectorEnv):
 
     def _reset_infos(self) -> Infos:
         return {**super()._reset_infos(), "optimal_steps": self._optimal_steps()}
+
+
+def _is_per_row(value: Any) -> bool:
+    """Return whether an option is a sequence with a value for each environment, rather than one value for all."""
+    return isinstance(value, Sequence | np.ndarray) and not isinstance(value, str) and getattr(value, "ndim", 1) > 0
 
 
 def check_num_envs(num_envs: int) -> None:

@@ -308,3 +308,77 @@ def test_environment_checkers_find_nothing(n_stars: int, layout: str, env_id: st
 def test_long_run_of_random_actions(env_id: str) -> None:
     options = [{"n_stars": n, "layout": layout} for n, layout in ((1, "fork"), (3, "comb"), (5, "random"))]
     assert_long_run_stays_sound(env_id, 1_000_000, options)
+
+
+CROSSING = """
+    H...#
+    .##*#
+    *#~~~
+"""
+
+
+@pytest.mark.parametrize("env_id", ENVS)
+def test_map_of_the_user_is_walked_and_stars_lie_where_they_are_marked(env_id: str) -> None:
+    env = gym.make(env_id, n_stars=2, layout=CROSSING, render_mode="ansi")
+    assert env.observation_space.shape == (80,)
+    observation, info = env.reset(seed=0)
+    assert info["variation"] == {"n_stars": 2, "layout": "H...#\n.##*#\n*#~~~"}
+    assert info["optimal_steps"] == 2 + 2 + 3 + 1
+    assert env.render().splitlines() == ["H...######", ".##*######", "*#~~~#####", *["##########"] * 5]
+    named = dict(zip(env.unwrapped.observation_names, observation, strict=True))
+    seen = named["map[2,0]"] if env_id == "Hiking-v0" else named["window[+2,+0]"]
+    assert seen == env.unwrapped.star_value
+    results = [env.step(action) for action in env.unwrapped.plan()]
+    assert [result[2] for result in results] == [False] * 7 + [True]
+
+
+def test_map_of_the_user_is_an_option_that_stays_in_force_and_may_be_given_as_rows() -> None:
+    env = gym.make("Hiking-v0", n_stars=1)
+    rows = ["H.", "#."]
+    for options in ({"layout": rows}, None):
+        _, info = env.reset(seed=0, options=options)
+        assert info["variation"]["layout"] == "H.\n#."
+    assert {env.reset()[1]["optimal_steps"] for _ in range(20)} == {1, 2}
+    assert env.reset(options={"layout": "fork"})[1]["variation"]["layout"] == "fork"
+
+
+def test_batch_takes_a_map_for_all_or_one_for_each() -> None:
+    batched = gym.make_vec("Hiking-v0", num_envs=2, vectorization_mode="vector_entry_point", n_stars=1)
+    for layouts in ("H.\n#.", ["H.\n#.", "comb"], [("H.", "#."), "comb"]):
+        observations, infos = batched.reset(seed=3, options={"layout": layouts})
+        for row, layout in enumerate([layouts] * 2 if isinstance(layouts, str) else layouts):
+            observation, info = gym.make("Hiking-v0", n_stars=1, layout=layout).reset(seed=3 + row)
+            np.testing.assert_array_equal(observations[row], observation)
+            assert infos["variation"][row] == info["variation"]
+
+
+@pytest.mark.parametrize(
+    ("layout", "said"),
+    [
+        ("valey", "layout='valey' is not accepted; layout is one of 'valley'.* or a map as rows of text"),
+        (5, "layout=5 is not accepted"),
+        ({"H": "."}, "is not accepted"),
+        (["H.", "."], r"layout: a map of 2 rows of lengths \[1, 2\] .* up to 8 rows of equal length, up to 10"),
+        (["H."] * 9, "a map of 9 rows"),
+        (["H" + "." * 10], r"lengths \[11\]"),
+        (["H.x"], "'x' in row 0, column 2 of a map is not accepted; a cell is"),
+        (["..", ".."], "a map with 0 starts"),
+        (["H.", ".H"], "a map with 2 starts"),
+        (["H#"], "no place for a star"),
+        (["H.#.", "####"], "no way leads from the start to row 0, column 3 .* mark with"),
+        (["H..*", "##*#", "####", "*###"], "no way leads from the start to row 1, column 2|row 3, column 0"),
+        (["H.."], "n_stars=3 is not accepted; on this layout n_stars is at most 2"),
+    ],
+)
+def test_map_that_is_not_accepted_is_refused_and_changes_nothing(layout: object, said: str) -> None:
+    env = HikingEnv()
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=said):
+        env.reset(options={"layout": layout})
+    with pytest.raises(ValueError, match=said):
+        gym.make_vec("HikingEgo-v0", num_envs=2, layout=layout)
+    assert env.reset()[1]["variation"] == {"n_stars": 3, "layout": "valley"}
+
+
+def test_pathways_without_stars_need_not_be_connected() -> None:
+    assert HikingEnv(n_stars=1, layout=["H.*", "###", "..#"]).reset(seed=0)[1]["optimal_steps"] == 2
