@@ -88,9 +88,9 @@ def evaluate_program(
     :return: one row for each variation
     :raises ValueError: if an argument is not accepted or the program does not fit the environment
     """
-    env_id = env_id or program.metadata.get("env")
+    env_id = env_id or id_from_file(program.metadata.get("env"))
     if not env_id:
-        raise ValueError("the program does not say which environment it is for; give env_id")
+        raise ValueError("the program does not say which environment it is for, or names a module; give env_id")
 
     _refuse_wrappers("the program", program.metadata.get("wrappers", ()))
 
@@ -297,6 +297,17 @@ def spec_of(env_id: str) -> Any:
         return gym.spec(name)
     except gym.error.Error:
         raise unknown("environment", env_id, gym.registry) from None
+
+
+def id_from_file(env_id: Any) -> str | None:
+    """Return an environment id that a file gives, unless a module would have to be imported for it, which runs code.
+
+    :param env_id: from the metadata of a program
+    """
+    if not isinstance(env_id, str):
+        return None
+    module = env_id.rpartition(":")[0]
+    return env_id if not module or module in sys.modules else None
 
 
 def _as_json(value: Any) -> Any:

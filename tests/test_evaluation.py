@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
-from sb3_progpolicy import ReptilePPO, evaluate_model, evaluate_program
+from sb3_progpolicy import ReptilePPO, evaluate_model, evaluate_program, load_pretrained
+from sb3_progpolicy.cli import run
 from tests.handwritten.hanoi import hanoi_program
 
 SIZES = [{"n_discs": n_discs} for n_discs in range(1, 6)]
@@ -89,3 +90,18 @@ def test_environment_without_a_goal_is_refused():
     assert "is_success" not in gym.make("CartPole-v1").reset()[1]
     with pytest.raises(ValueError, match="is_success"):
         evaluate_model(PPO("MlpPolicy", "CartPole-v1", n_steps=8, batch_size=8), "CartPole-v1")
+
+
+def test_program_file_imports_no_module(tmp_path, monkeypatch, capsys):
+    (tmp_path / "evil_module.py").write_text("raise SystemExit('imported')")
+    monkeypatch.chdir(tmp_path)
+    program = replace(load_pretrained("Hanoi-v0"), metadata={"env": "evil_module:Hanoi-v0"})
+    with pytest.raises(ValueError, match="give env_id"):
+        evaluate_program(program, variations=[{"n_discs": 1}])
+    program.save(tmp_path / "program.json")
+    assert run(["evaluate", "program.json", "--set", "n_discs=1"]) == 2
+    assert "give --env" in capsys.readouterr().err
+    assert run(["show", "program.json"]) == 0
+    # A module that is imported already registers its ids anyway.
+    known = replace(program, metadata={"env": "progpolicy_envs:Hanoi-v0"})
+    assert evaluate_program(known, variations=[{"n_discs": 1}])[0].success_rate == 1

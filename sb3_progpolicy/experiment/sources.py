@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,7 +43,10 @@ def find_source(name: str, allow_pickle: bool = False) -> Source:
     if path.is_dir():
         return _from_run(path, allow_pickle)
     if path.is_file() and path.suffix == ".json":
-        return _from_program(name, load_program(path))
+        from sb3_progpolicy.evaluation import id_from_file
+
+        source = _from_program(name, load_program(path))
+        return replace(source, env_id=id_from_file(source.env_id))
     if path.is_file() and path.suffix == ".zip":
         return _from_model(path, allow_pickle)
     if path.suffix in (".json", ".zip") or path.is_file():
