@@ -36,6 +36,11 @@ from progpolicy_envs.vector import PlanningVectorEnv
 
 MAX_STARS = 12
 RANDOM = "random"
+STEP_REWARD, ILLEGAL_REWARD, STAR_REWARD = -0.01, -0.05, 1.0
+
+ACTION_NAMES = tuple(DIRECTIONS)
+BLOCKED, PATHWAY = -1.0, 0.0
+_OBSERVATION_SPACE = spaces.Box(-1.0, 1.0, (N_CELLS,), dtype=np.float32)
 
 
 def _are_rows(value: Any) -> bool:
@@ -67,14 +72,6 @@ class LayoutParameter(ChoiceParameter):
         except ValueError as error:
             raise ValueError(f"{self.name}: {error}") from None
         return "\n".join(rows)
-
-
-STEP_REWARD, ILLEGAL_REWARD, STAR_REWARD = -0.01, -0.05, 1.0
-
-ACTION_NAMES = tuple(DIRECTIONS)
-BLOCKED, PATHWAY = -1.0, 0.0
-_OBSERVATION_SPACE = spaces.Box(-1.0, 1.0, (N_CELLS,), dtype=np.float32)
-_FIRST_LAYOUT = LAYOUTS["valley"]
 
 
 def named_layout(value: str) -> Layout:
@@ -118,6 +115,14 @@ def layout_value(layout: Layout) -> str:
     return names[0] if names else "\n".join(layout.rows)
 
 
+def _reachable_cell(name: str, value: Any, layout: Layout) -> int:
+    row, column = read_cell(name, value, N_ROWS, N_COLUMNS)
+    cell = row * N_COLUMNS + column
+    if layout.distances[layout.start, cell] < 0:
+        raise ValueError(f"{name}: [{row}, {column}] is not accepted; no way leads there from the map's start")
+    return cell
+
+
 def read_state(state: Mapping[str, Any]) -> tuple[int, Layout, int, list[int]]:
     """Return the number of stars, the map, the hiker's cell and the cells of the stars that are left.
 
@@ -134,17 +139,8 @@ def read_state(state: Mapping[str, Any]) -> tuple[int, Layout, int, list[int]]:
             f"stars={stars!r} is not accepted; stars are up to n_stars={n_stars} pairs of row and column, one for each "
             "star that is left"
         )
-    hiker, *cells = [
-        row * N_COLUMNS + column
-        for row, column in [
-            read_cell("hiker", state["hiker"], N_ROWS, N_COLUMNS),
-            *(read_cell("stars", star, N_ROWS, N_COLUMNS) for star in stars),
-        ]
-    ]
-    for name, cell in (("hiker", hiker), *(("stars", cell) for cell in cells)):
-        if layout.distances[layout.start, cell] < 0:
-            row, column = divmod(cell, N_COLUMNS)
-            raise ValueError(f"{name}: [{row}, {column}] is not accepted; no way leads there from the map's start")
+    hiker = _reachable_cell("hiker", state["hiker"], layout)
+    cells = [_reachable_cell("stars", star, layout) for star in stars]
     if len({hiker, *cells}) <= len(cells):
         raise ValueError(f"stars={stars!r} is not accepted; hiker and stars have each a cell of their own")
     return variation["n_stars"], layout, hiker, cells
@@ -287,7 +283,7 @@ class PathwayVectorEnv(MapView, PlanningVectorEnv):
         self._first_places = self._rows * self.n_numbers
         self._hikers = np.zeros(num_envs, dtype=np.int64)
         self._stars_left = np.zeros(num_envs, dtype=np.int64)
-        self._layouts: list[Layout] = [_FIRST_LAYOUT] * num_envs
+        self._layouts: list[Layout] = [LAYOUTS["valley"]] * num_envs
         self._stars: list[NDArray[np.int64]] = [np.zeros(0, dtype=np.int64)] * num_envs
 
     def _reset_rows(self, rows: NDArray[np.intp]) -> None:

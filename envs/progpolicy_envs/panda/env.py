@@ -75,11 +75,6 @@ class PandaEnv(DomainEnv):
         self._camera = Camera(self.scene, self.task) if render_mode is not None else None
         self._approach_distance = 0.0
 
-    @property
-    def size(self) -> int:
-        """Number of objects, or of targets in Reach."""
-        return int(next(iter(self.variation.values())))
-
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Apply one action for 1/30 s.
 
