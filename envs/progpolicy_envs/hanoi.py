@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from progpolicy_envs.planners import hanoi as planner
 from progpolicy_envs.planning import PlanningEnv
 from progpolicy_envs.rendering import hanoi_frame
+from progpolicy_envs.states import is_sequence
 from progpolicy_envs.variation import IntParameter, Variation, VariationSpace
 from progpolicy_envs.vector import PlanningVectorEnv
 
@@ -18,11 +20,6 @@ MAX_DISCS = 12
 N_PEGS = 3
 RANDOM = "random"
 MOVES: tuple[tuple[int, int], ...] = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
-VARIATIONS = VariationSpace(
-    IntParameter("n_discs", 1, MAX_DISCS, "number of discs"),
-    IntParameter("source", 0, N_PEGS - 1, "peg on which all discs start", (RANDOM,)),
-    IntParameter("target", 0, N_PEGS - 1, "peg to which all discs go; not the source", (RANDOM,)),
-)
 _N_TOPS = MAX_DISCS + 1  # a peg's top disc, or none
 STEP_REWARD, ILLEGAL_REWARD, GOAL_REWARD = -0.01, -0.05, 1.0
 
@@ -33,18 +30,22 @@ _OBSERVATION_SPACE = spaces.Box(
 )
 
 
-def check_variation(variation: Variation) -> Variation:
-    """Return ``variation``.
-
-    :param variation: values of ``n_discs``, ``source`` and ``target``, each in its range
-    :raises ValueError: if source and target are the same peg
-    """
+def _check_variation(variation: Variation) -> None:
+    """Raise ``ValueError`` if source and target are the same peg."""
     if variation["source"] == variation["target"] != RANDOM:
         raise ValueError(
             f"source={variation['source']} and target={variation['target']} are not accepted together; "
             "they are two different pegs from 0 to 2, or 'random'"
         )
-    return variation
+
+
+VARIATIONS = VariationSpace(
+    IntParameter("n_discs", 1, MAX_DISCS, "number of discs"),
+    IntParameter("source", 0, N_PEGS - 1, "peg on which all discs start", (RANDOM,)),
+    IntParameter("target", 0, N_PEGS - 1, "peg to which all discs go; not the source", (RANDOM,)),
+    check=_check_variation,
+    starts={"discs": "the peg of each disc, the smallest first"},
+)
 
 
 def _peg_pairs(variation: Variation) -> list[tuple[int, int]]:
@@ -57,6 +58,26 @@ def _peg_pairs(variation: Variation) -> list[tuple[int, int]]:
 def _draw_pegs(pairs: list[tuple[int, int]], rng: np.random.Generator) -> tuple[int, int]:
     """Draw source and target of an episode."""
     return pairs[int(len(pairs) * rng.random())] if len(pairs) > 1 else pairs[0]
+
+
+def read_state(state: Mapping[str, Any]) -> tuple[list[int], int, int]:
+    """Return discs, source and target of a state.
+
+    :param state: values of ``n_discs``, ``source``, ``target`` and ``discs``; see :attr:`HanoiEnv.state`
+    :raises ValueError: if it is not a state
+    """
+    discs = state["discs"]
+    variation = VARIATIONS.update({}, {name: state[name] for name in VARIATIONS})
+    if RANDOM in (variation["source"], variation["target"]):
+        raise ValueError(f"{RANDOM!r} is not accepted in a state; its source and target are pegs from 0 to 2")
+    pegs = VARIATIONS["source"]
+    if not is_sequence(discs) or len(discs) != variation["n_discs"]:
+        raise ValueError(
+            f"discs={discs!r} is not accepted; discs are {variation['n_discs']} pegs, one for each of the n_discs discs"
+        )
+    if RANDOM in discs:
+        raise ValueError(f"discs={discs!r} is not accepted; each is a peg from 0 to 2")
+    return [int(pegs.parse(peg)) for peg in discs], int(variation["source"]), int(variation["target"])
 
 
 class HanoiEnv(PlanningEnv):
@@ -95,7 +116,8 @@ class HanoiEnv(PlanningEnv):
 
     ## Starting State
     All discs on the source peg. Source and target are fixed or, where they are ``"random"``, drawn for each episode,
-    which shows a policy the same puzzle from all sides.
+    which shows a policy the same puzzle from all sides. ``env.reset(options={"discs": [1, 0, 0]})`` starts from any
+    legal state: the peg of each disc, the smallest first.
 
     ## Episode End
     Terminated when all discs lie on the target peg; truncated after 500 steps (``max_episode_steps``).
@@ -128,36 +150,11 @@ class HanoiEnv(PlanningEnv):
     def __init__(
         self, n_discs: int = 3, source: int | str = 0, target: int | str = 2, render_mode: str | None = None
     ) -> None:
-        super().__init__(render_mode)
-        self.variation = check_variation(
-            self.variations.update({}, {"n_discs": n_discs, "source": source, "target": target})
-        )
+        super().__init__({"n_discs": n_discs, "source": source, "target": target}, render_mode)
         self.observation_space = _OBSERVATION_SPACE
         self.action_space = spaces.Discrete(len(MOVES))
-        self.source, self.target = _draw_pegs(_peg_pairs(self.variation), self.np_random)
-        self.discs: list[int] = [self.source] * self.variation["n_discs"]
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Put all discs onto the source peg.
-
-        :param seed: seeds the generator from which random pegs are drawn
-        :param options: new values of variation parameters; they stay in force
-        :return: observation ``(9,)`` and info
-        :raises ValueError: if a variation is not accepted; the variation in force is then unchanged
-        """
-        super().reset(seed=seed)
-        self.variation = check_variation(self.variations.update(self.variation, options))
-        self.source, self.target = _draw_pegs(_peg_pairs(self.variation), self.np_random)
-        self.discs = [self.source] * self.variation["n_discs"]
-        info = {
-            "is_success": False,
-            "variation": dict(self.variation),
-            "optimal_steps": planner.optimal_steps(self.discs, self.target),
-        }
-        self._show()
-        return self._observe(), info
+        self.source, self.target = 0, 0
+        self.discs: list[int] = []
 
     def step(self, action: np.int64 | int) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Move a disc, if the rules allow it.
@@ -178,9 +175,21 @@ class HanoiEnv(PlanningEnv):
         self._show()
         return self._observe(), reward, solved, False, {"is_success": solved}
 
-    def plan(self) -> list[int]:
-        """Return the actions of the one shortest solution from the present state."""
+    def _draw(self, variation: Variation) -> None:
+        self.source, self.target = _draw_pegs(_peg_pairs(variation), self.np_random)
+        self.discs = [self.source] * variation["n_discs"]
+
+    def _state(self) -> dict[str, Any]:
+        return {"n_discs": len(self.discs), "source": self.source, "target": self.target, "discs": list(self.discs)}
+
+    def _set_state(self, state: Mapping[str, Any]) -> None:
+        self.discs, self.source, self.target = read_state(state)
+
+    def _plan(self) -> list[int]:
         return [MOVES.index(move) for move in planner.plan(self.discs, self.target)]
+
+    def _optimal_steps(self) -> int:
+        return planner.optimal_steps(self.discs, self.target)
 
     def _tops(self) -> list[int]:
         """Index of the top disc of each peg, 0 the smallest; ``n_discs`` for an empty peg."""
@@ -248,7 +257,6 @@ class HanoiVectorEnv(PlanningVectorEnv):
     """
 
     variations: ClassVar[VariationSpace] = VARIATIONS
-    check_variation = staticmethod(check_variation)
     observation_names: ClassVar[tuple[str, ...]] = OBSERVATION_NAMES
     action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
 
@@ -266,9 +274,7 @@ class HanoiVectorEnv(PlanningVectorEnv):
         max_episode_steps: int | None = None,
     ) -> None:
         variation = self.variations.update({}, {"n_discs": n_discs, "source": source, "target": target})
-        super().__init__(
-            num_envs, _OBSERVATION_SPACE, spaces.Discrete(len(MOVES)), check_variation(variation), max_episode_steps
-        )
+        super().__init__(num_envs, _OBSERVATION_SPACE, spaces.Discrete(len(MOVES)), variation, max_episode_steps)
         self._bits = np.zeros((num_envs, N_PEGS), dtype=np.int64)
         self._tops = np.zeros((num_envs, N_PEGS), dtype=np.int64)
         self._n_discs = np.zeros(num_envs, dtype=np.int64)
@@ -277,10 +283,6 @@ class HanoiVectorEnv(PlanningVectorEnv):
         self._target = np.zeros(num_envs, dtype=np.int64)
         self._bases = np.zeros(num_envs, dtype=np.int64)
         self._random = np.zeros(num_envs, dtype=bool)
-        self._read_variations()
-
-    def _set_variations(self, options: Any) -> None:
-        super()._set_variations(options)
         self._read_variations()
 
     def _read_variations(self) -> None:
@@ -326,5 +328,25 @@ class HanoiVectorEnv(PlanningVectorEnv):
             ((tops[:, 0] * _N_TOPS + tops[:, 1]) * _N_TOPS + tops[:, 2]) * 2**N_PEGS + self._bases, axis=0
         )
 
+    def _state_of(self, row: int) -> dict[str, Any]:
+        discs = [
+            next(peg for peg in range(N_PEGS) if int(self._bits[row, peg]) >> disc & 1)
+            for disc in range(int(self._n_discs[row]))
+        ]
+        pegs = {"source": int(self._source[row]), "target": int(self._target[row])}
+        return {"n_discs": len(discs), **pegs, "discs": discs}
+
+    def _set_state_of(self, row: int, state: Mapping[str, Any]) -> None:
+        discs, _, _ = read_state(state)
+        self._bits[row] = [sum(1 << disc for disc, on in enumerate(discs) if on == peg) for peg in range(N_PEGS)]
+        self._tops[row] = self._TOP[self._bits[row]]
+
     def _optimal_steps(self) -> NDArray[np.int64]:
-        return self._full.copy()
+        steps, target = np.zeros(self.num_envs, dtype=np.int64), self._target
+        for disc in reversed(range(MAX_DISCS)):
+            # As in the planner: what is misplaced goes to the target once, after all smaller discs to the third peg.
+            on = (self._bits >> disc & 1).argmax(axis=1)
+            misplaced = (disc < self._n_discs) & (on != target)
+            steps += misplaced * 2**disc
+            target = np.where(misplaced, 3 - on - target, target)
+        return steps

@@ -65,6 +65,8 @@ _SECTIONS = {
         ## Starting State
         The hiker stands on the map's start, the stars lie on different pathway cells drawn with the environment's
         generator. With ``layout="random"`` each episode also draws one of 1024 generated maps.
+        ``env.reset(options={"hiker": [0, 1], "stars": [[0, 3], [2, 2]]})`` gives the places instead, as rows and
+        columns; of ``n_stars`` stars those that are left out have been collected.
 
         ## Episode End
         Terminated when the last star is collected; truncated after 500 steps (``max_episode_steps``).

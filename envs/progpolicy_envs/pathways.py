@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -17,6 +17,7 @@ from progpolicy_envs.layouts import (
     N_CELLS,
     N_COLUMNS,
     N_RANDOM_LAYOUTS,
+    N_ROWS,
     NEIGHBOURS,
     PATH,
     STAR,
@@ -29,15 +30,21 @@ from progpolicy_envs.layouts import (
 from progpolicy_envs.planners import hiking as planner
 from progpolicy_envs.planning import PlanningEnv
 from progpolicy_envs.rendering import hiking_frame
+from progpolicy_envs.states import is_sequence, read_cell
 from progpolicy_envs.variation import ChoiceParameter, IntParameter, Variation, VariationSpace
 from progpolicy_envs.vector import PlanningVectorEnv
 
 MAX_STARS = 12
 RANDOM = "random"
+STEP_REWARD, ILLEGAL_REWARD, STAR_REWARD = -0.01, -0.05, 1.0
+
+ACTION_NAMES = tuple(DIRECTIONS)
+BLOCKED, PATHWAY = -1.0, 0.0
+_OBSERVATION_SPACE = spaces.Box(-1.0, 1.0, (N_CELLS,), dtype=np.float32)
 
 
 def _are_rows(value: Any) -> bool:
-    return isinstance(value, Sequence) and all(isinstance(row, str) for row in value)
+    return is_sequence(value) and all(isinstance(row, str) for row in value)
 
 
 @dataclass(frozen=True)
@@ -67,34 +74,28 @@ class LayoutParameter(ChoiceParameter):
         return "\n".join(rows)
 
 
-VARIATIONS = VariationSpace(
-    IntParameter("n_stars", 1, MAX_STARS, "number of stars"),
-    LayoutParameter("layout", (*LAYOUTS, RANDOM), "the map; 'random' draws another one for every episode"),
-)
-STEP_REWARD, ILLEGAL_REWARD, STAR_REWARD = -0.01, -0.05, 1.0
-
-ACTION_NAMES = tuple(DIRECTIONS)
-BLOCKED, PATHWAY = -1.0, 0.0
-_OBSERVATION_SPACE = spaces.Box(-1.0, 1.0, (N_CELLS,), dtype=np.float32)
-_FIRST_LAYOUT = LAYOUTS["valley"]
-
-
 def named_layout(value: str) -> Layout:
     """Return the map of a value of ``layout`` that is not random."""
     return LAYOUTS[value] if value in LAYOUTS else read_layout(split_rows(value))
 
 
-def check_variation(variation: Variation) -> Variation:
-    """Return ``variation``.
-
-    :param variation: values of ``n_stars`` and ``layout``, each in its range
-    :raises ValueError: if the map has fewer places for stars than there are stars
-    """
+def _check_variation(variation: Variation) -> None:
+    """Raise ``ValueError`` if the map has fewer places for stars than there are stars."""
     n_stars, layout = variation["n_stars"], variation["layout"]
     n_places = MAX_STARS if layout == RANDOM else len(named_layout(layout).star_cells)
     if n_stars > n_places:
         raise ValueError(f"n_stars={n_stars} is not accepted; on this layout n_stars is at most {n_places}")
-    return variation
+
+
+VARIATIONS = VariationSpace(
+    IntParameter("n_stars", 1, MAX_STARS, "number of stars"),
+    LayoutParameter("layout", (*LAYOUTS, RANDOM), "the map; 'random' draws another one for every episode"),
+    check=_check_variation,
+    starts={
+        "hiker": "row and column of the hiker",
+        "stars": "row and column of each star that is left",
+    },
+)
 
 
 def draw_task(generator: np.random.Generator, variation: Variation) -> tuple[Layout, NDArray[np.int64]]:
@@ -106,6 +107,43 @@ def draw_task(generator: np.random.Generator, variation: Variation) -> tuple[Lay
     value = variation["layout"]
     layout = random_layout(int(generator.integers(N_RANDOM_LAYOUTS))) if value == RANDOM else named_layout(value)
     return layout, generator.permutation(layout.star_cells)[: variation["n_stars"]]
+
+
+def layout_value(layout: Layout) -> str:
+    """Return the value of ``layout`` that stands for a map: its name, or its rows joined by line feeds."""
+    names = [name for name, named in LAYOUTS.items() if named.rows == layout.rows]
+    return names[0] if names else "\n".join(layout.rows)
+
+
+def _reachable_cell(name: str, value: Any, layout: Layout) -> int:
+    row, column = read_cell(name, value, N_ROWS, N_COLUMNS)
+    cell = row * N_COLUMNS + column
+    if layout.distances[layout.start, cell] < 0:
+        raise ValueError(f"{name}: [{row}, {column}] is not accepted; no way leads there from the map's start")
+    return cell
+
+
+def read_state(state: Mapping[str, Any]) -> tuple[int, Layout, int, list[int]]:
+    """Return the number of stars, the map, the hiker's cell and the cells of the stars that are left.
+
+    :param state: values of ``n_stars``, ``layout``, ``hiker`` and ``stars``; see :attr:`PathwayEnv.state`
+    :raises ValueError: if it is not a state
+    """
+    n_stars, layout_name, stars = state["n_stars"], state["layout"], state["stars"]
+    variation = VARIATIONS.update({}, {"n_stars": n_stars, "layout": layout_name})
+    if variation["layout"] == RANDOM:
+        raise ValueError(f"layout={RANDOM!r} is not accepted in a state; give the map as rows of text")
+    layout = named_layout(variation["layout"])
+    if not is_sequence(stars) or len(stars) > variation["n_stars"]:
+        raise ValueError(
+            f"stars={stars!r} is not accepted; stars are up to n_stars={n_stars} pairs of row and column, one for each "
+            "star that is left"
+        )
+    hiker = _reachable_cell("hiker", state["hiker"], layout)
+    cells = [_reachable_cell("stars", star, layout) for star in stars]
+    if len({hiker, *cells}) <= len(cells):
+        raise ValueError(f"stars={stars!r} is not accepted; hiker and stars have each a cell of their own")
+    return variation["n_stars"], layout, hiker, cells
 
 
 class MapView:
@@ -139,36 +177,12 @@ class PathwayEnv(MapView, PlanningEnv):
     def __init__(
         self, n_stars: int = 3, layout: str | Sequence[str] = "valley", render_mode: str | None = None
     ) -> None:
-        super().__init__(render_mode)
-        self.variation = check_variation(self.variations.update({}, {"n_stars": n_stars, "layout": layout}))
+        super().__init__({"n_stars": n_stars, "layout": layout}, render_mode)
         self.observation_space = _OBSERVATION_SPACE
         self.action_space = spaces.Discrete(len(ACTION_NAMES))
-        self._set_layout(_FIRST_LAYOUT)
-        self.hiker = self.layout.start
+        self.n_stars = 0
+        self.hiker = 0
         self.stars: set[int] = set()
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Put the hiker onto the start and lay out the stars.
-
-        :param seed: seeds the generator that draws stars and random maps
-        :param options: new values of variation parameters; they stay in force
-        :return: observation ``(80,)`` and info
-        :raises ValueError: if a variation is not accepted; the variation in force is then unchanged
-        """
-        super().reset(seed=seed)
-        self.variation = check_variation(self.variations.update(self.variation, options))
-        layout, stars = draw_task(self.np_random, self.variation)
-        self._set_layout(layout)
-        self.hiker, self.stars = layout.start, set(stars.tolist())
-        info = {
-            "is_success": False,
-            "variation": dict(self.variation),
-            "optimal_steps": planner.optimal_steps(layout, self.hiker, stars.tolist()),
-        }
-        self._show()
-        return self._observe(), info
 
     def step(self, action: np.int64 | int) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Walk one cell, if it is a pathway.
@@ -190,13 +204,30 @@ class PathwayEnv(MapView, PlanningEnv):
         self._show()
         return self._observe(), reward, solved, False, {"is_success": solved}
 
-    def plan(self) -> list[int]:
-        """Return the actions of a shortest tour over the stars that are left, from the hiker's present place."""
+    def _draw(self, variation: Variation) -> None:
+        layout, stars = draw_task(self.np_random, variation)
+        self._place(len(stars), layout, layout.start, stars.tolist())
+
+    def _state(self) -> dict[str, Any]:
+        return {
+            "n_stars": self.n_stars,
+            "layout": layout_value(self.layout),
+            "hiker": list(divmod(self.hiker, N_COLUMNS)),
+            "stars": [list(cell) for cell in self._star_cells()],
+        }
+
+    def _set_state(self, state: Mapping[str, Any]) -> None:
+        self._place(*read_state(state))
+
+    def _place(self, n_stars: int, layout: Layout, hiker: int, stars: list[int]) -> None:
+        self.n_stars, self.layout, self.hiker, self.stars = n_stars, layout, hiker, set(stars)
+        self._ground = self.ground(layout)
+
+    def _plan(self) -> list[int]:
         return planner.plan(self.layout, self.hiker, sorted(self.stars))
 
-    def _set_layout(self, layout: Layout) -> None:
-        self.layout = layout
-        self._ground = self.ground(layout)
+    def _optimal_steps(self) -> int:
+        return planner.optimal_steps(self.layout, self.hiker, sorted(self.stars))
 
     def _observe(self) -> NDArray[np.float32]:
         numbers = self._ground.copy()
@@ -212,9 +243,7 @@ class PathwayEnv(MapView, PlanningEnv):
         """
 
     def _frame(self) -> NDArray[np.uint8]:
-        return hiking_frame(
-            self.layout.rows, divmod(self.hiker, N_COLUMNS), self._star_cells(), self.variation["n_stars"]
-        )
+        return hiking_frame(self.layout.rows, divmod(self.hiker, N_COLUMNS), self._star_cells(), self.n_stars)
 
     def _star_cells(self) -> list[tuple[int, int]]:
         return [divmod(star, N_COLUMNS) for star in sorted(self.stars)]
@@ -239,7 +268,6 @@ class PathwayVectorEnv(MapView, PlanningVectorEnv):
     """
 
     variations: ClassVar[VariationSpace] = VARIATIONS
-    check_variation = staticmethod(check_variation)
     action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
 
     def __init__(
@@ -249,25 +277,27 @@ class PathwayVectorEnv(MapView, PlanningVectorEnv):
         layout: str | Sequence[str] = "valley",
         max_episode_steps: int | None = None,
     ) -> None:
-        variation = check_variation(self.variations.update({}, {"n_stars": n_stars, "layout": layout}))
+        variation = self.variations.update({}, {"n_stars": n_stars, "layout": layout})
         super().__init__(num_envs, _OBSERVATION_SPACE, spaces.Discrete(len(ACTION_NAMES)), variation, max_episode_steps)
         self._numbers = np.full((num_envs, self.n_numbers), BLOCKED, dtype=np.float32)
         self._first_places = self._rows * self.n_numbers
         self._hikers = np.zeros(num_envs, dtype=np.int64)
         self._stars_left = np.zeros(num_envs, dtype=np.int64)
-        self._layouts: list[Layout] = [_FIRST_LAYOUT] * num_envs
+        self._layouts: list[Layout] = [LAYOUTS["valley"]] * num_envs
         self._stars: list[NDArray[np.int64]] = [np.zeros(0, dtype=np.int64)] * num_envs
 
     def _reset_rows(self, rows: NDArray[np.intp]) -> None:
-        places = self.places
         for row in rows:
             layout, stars = draw_task(self._generators[row], self.row_variations[row])
-            numbers = self._numbers[row]
-            numbers[:] = self.ground(layout)
-            numbers[places[stars]] = self.star_value
-            numbers[places[layout.start]] = self.hiker_value
-            self._layouts[row], self._stars[row] = layout, stars
-            self._hikers[row], self._stars_left[row] = layout.start, len(stars)
+            self._place(row, layout, layout.start, stars)
+
+    def _place(self, row: int | np.intp, layout: Layout, hiker: int, stars: NDArray[np.int64]) -> None:
+        numbers, places = self._numbers[row], self.places
+        numbers[:] = self.ground(layout)
+        numbers[places[stars]] = self.star_value
+        numbers[places[hiker]] = self.hiker_value
+        self._layouts[row], self._stars[row] = layout, stars
+        self._hikers[row], self._stars_left[row] = hiker, len(stars)
 
     def _move(self, actions: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         numbers, hikers, places = self._numbers.ravel(), self._hikers, self.places
@@ -282,14 +312,29 @@ class PathwayVectorEnv(MapView, PlanningVectorEnv):
         rewards = np.where(legal, STEP_REWARD, STEP_REWARD + ILLEGAL_REWARD) + STAR_REWARD * found
         return rewards, self._stars_left == 0
 
+    def _left(self, row: int) -> list[int]:
+        """Return the cells of the stars that are left in one environment."""
+        stars = self._stars[row]
+        return stars[self._numbers[row, self.places[stars]] == self.star_value].tolist()
+
+    def _state_of(self, row: int) -> dict[str, Any]:
+        return {
+            "n_stars": self.row_variations[row]["n_stars"],
+            "layout": layout_value(self._layouts[row]),
+            "hiker": list(divmod(int(self._hikers[row]), N_COLUMNS)),
+            "stars": [list(divmod(star, N_COLUMNS)) for star in self._left(row)],
+        }
+
+    def _set_state_of(self, row: int, state: Mapping[str, Any]) -> None:
+        _, layout, hiker, stars = read_state(state)
+        self._place(row, layout, hiker, np.array(stars, dtype=np.int64))
+
     def _optimal_steps(self) -> NDArray[np.int64]:
         steps = np.zeros(self.num_envs, dtype=np.int64)
-        n_stars = np.array([len(stars) for stars in self._stars])
-        for n in np.unique(n_stars):
-            rows = np.flatnonzero(n_stars == n)
-            distances = [
-                planner.tour_distances(self._layouts[row], self._layouts[row].start, self._stars[row].tolist())
-                for row in rows
-            ]
+        left = [self._left(row) for row in range(self.num_envs)]
+        n_left = np.array([len(stars) for stars in left])
+        for n in np.unique(n_left):
+            rows = np.flatnonzero(n_left == n)
+            distances = [planner.tour_distances(self._layouts[row], int(self._hikers[row]), left[row]) for row in rows]
             steps[rows] = planner.tour_lengths(np.stack(distances))
         return steps

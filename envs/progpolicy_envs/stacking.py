@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,6 +13,7 @@ from progpolicy_envs.layouts import DIRECTIONS
 from progpolicy_envs.planners import stacking as planner
 from progpolicy_envs.planning import PlanningEnv
 from progpolicy_envs.rendering import stacking_frame
+from progpolicy_envs.states import Cell, is_sequence, read_cell
 from progpolicy_envs.variation import IntParameter, Variation, VariationSpace
 from progpolicy_envs.vector import PlanningVectorEnv
 
@@ -19,7 +21,13 @@ MAX_PLATES = 8
 N_SIDE = 5
 N_CELLS = N_SIDE**2
 PICK = planner.PICK
-VARIATIONS = VariationSpace(IntParameter("n_plates", 1, MAX_PLATES, "number of plates"))
+VARIATIONS = VariationSpace(
+    IntParameter("n_plates", 1, MAX_PLATES, "number of plates"),
+    starts={
+        "plates": "row and column of each plate on the table, the largest first",
+        "gripper": "row and column of the gripper",
+    },
+)
 STEP_REWARD, ILLEGAL_REWARD, PLATE_REWARD = -0.01, -0.05, 1.0
 #: How many times a plate's number on the table is that of the next smaller one. A power of 2, so that all are exact.
 DOMINANCE = 8.0
@@ -44,6 +52,25 @@ def draw_task(generator: np.random.Generator, variation: Variation) -> tuple[NDA
     :param variation: the value of ``n_plates``
     """
     return generator.permutation(N_CELLS)[: variation["n_plates"]], int(generator.integers(N_CELLS))
+
+
+def read_state(state: Mapping[str, Any]) -> tuple[int, list[Cell], Cell]:
+    """Return the number of plates, the cells of those on the table and the gripper's cell.
+
+    :param state: values of ``n_plates``, ``plates`` and ``gripper``; see :attr:`StackingEnv.state`
+    :raises ValueError: if it is not a state
+    """
+    n_plates = VARIATIONS.update({}, {"n_plates": state["n_plates"]})["n_plates"]
+    plates, gripper = state["plates"], state["gripper"]
+    if not is_sequence(plates) or len(plates) > n_plates:
+        raise ValueError(
+            f"plates={plates!r} is not accepted; plates are up to n_plates={n_plates} pairs of row and column, one for "
+            "each plate on the table"
+        )
+    cells = [read_cell("plates", plate, N_SIDE, N_SIDE) for plate in plates]
+    if len(set(cells)) < len(cells):
+        raise ValueError(f"plates={plates!r} is not accepted; each plate has a cell of its own")
+    return n_plates, cells, read_cell("gripper", gripper, N_SIDE, N_SIDE)
 
 
 class StackingEnv(PlanningEnv):
@@ -86,6 +113,8 @@ class StackingEnv(PlanningEnv):
 
     ## Starting State
     Plates and gripper on cells drawn with the environment's generator; the gripper may start above a plate.
+    ``env.reset(options={"n_plates": 2, "plates": [[0, 0], [3, 4]], "gripper": [2, 2]})`` gives them instead, as rows
+    and columns, the largest plate first; of ``n_plates`` plates those that are left out are on the stack.
 
     ## Episode End
     Terminated when all plates are on the stack; truncated after 500 steps (``max_episode_steps``).
@@ -115,35 +144,12 @@ class StackingEnv(PlanningEnv):
     action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
 
     def __init__(self, n_plates: int = 3, render_mode: str | None = None) -> None:
-        super().__init__(render_mode)
-        self.variation = self.variations.update({}, {"n_plates": n_plates})
+        super().__init__({"n_plates": n_plates}, render_mode)
         self.observation_space = _OBSERVATION_SPACE
         self.action_space = spaces.Discrete(len(ACTION_NAMES))
-        self.plates: list[tuple[int, int]] = []
-        self.gripper = (0, 0)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Lay the plates onto the table and place the gripper.
-
-        :param seed: seeds the generator that draws the positions
-        :param options: new values of variation parameters; they stay in force
-        :return: observation ``(35,)`` and info
-        :raises ValueError: if a variation is not accepted; the variation in force is then unchanged
-        """
-        super().reset(seed=seed)
-        self.variation = self.variations.update(self.variation, options)
-        cells, gripper = draw_task(self.np_random, self.variation)
-        self.plates = [divmod(cell, N_SIDE) for cell in cells.tolist()]
-        self.gripper = divmod(gripper, N_SIDE)
-        info = {
-            "is_success": False,
-            "variation": dict(self.variation),
-            "optimal_steps": planner.optimal_steps(self.gripper, self.plates),
-        }
-        self._show()
-        return self._observe(), info
+        self.n_plates = 0
+        self.plates: list[Cell] = []
+        self.gripper: Cell = (0, 0)
 
     def step(self, action: np.int64 | int) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Move the gripper or pick a plate up, if that is possible.
@@ -171,12 +177,27 @@ class StackingEnv(PlanningEnv):
         self._show()
         return self._observe(), reward, solved, False, {"is_success": solved}
 
-    def plan(self) -> list[int]:
-        """Return the actions of a shortest solution from the present state."""
+    def _draw(self, variation: Variation) -> None:
+        cells, gripper = draw_task(self.np_random, variation)
+        self.n_plates = len(cells)
+        self.plates = [divmod(cell, N_SIDE) for cell in cells.tolist()]
+        self.gripper = divmod(gripper, N_SIDE)
+
+    def _state(self) -> dict[str, Any]:
+        plates = [list(plate) for plate in self.plates]
+        return {"n_plates": self.n_plates, "plates": plates, "gripper": list(self.gripper)}
+
+    def _set_state(self, state: Mapping[str, Any]) -> None:
+        self.n_plates, self.plates, self.gripper = read_state(state)
+
+    def _plan(self) -> list[int]:
         return planner.plan(self.gripper, self.plates)
 
+    def _optimal_steps(self) -> int:
+        return planner.optimal_steps(self.gripper, self.plates)
+
     def _observe(self) -> NDArray[np.float32]:
-        n_plates = self.variation["n_plates"]
+        n_plates = self.n_plates
         observation = np.zeros(len(OBSERVATION_NAMES), dtype=np.float32)
         for rank, (row, column) in enumerate(self.plates):
             observation[row * N_SIDE + column] = DOMINANCE**-rank
@@ -186,7 +207,7 @@ class StackingEnv(PlanningEnv):
         return observation
 
     def _frame(self) -> NDArray[np.uint8]:
-        return stacking_frame(N_SIDE, self.plates, self.variation["n_plates"], self.gripper)
+        return stacking_frame(N_SIDE, self.plates, self.n_plates, self.gripper)
 
     def _text(self) -> str:
         sizes = {plate: len(self.plates) - rank for rank, plate in enumerate(self.plates)}
@@ -195,7 +216,7 @@ class StackingEnv(PlanningEnv):
             cells = [str(sizes.get((row, column), ".")) for column in range(N_SIDE)]
             marked = [f"[{cell}]" if (row, c) == self.gripper else f" {cell} " for c, cell in enumerate(cells)]
             rows.append("".join(marked).rstrip())
-        stack = " ".join(str(size) for size in range(self.variation["n_plates"], len(self.plates), -1))
+        stack = " ".join(str(size) for size in range(self.n_plates, len(self.plates), -1))
         return "\n".join([*rows, f"stack: {stack}".strip()]) + "\n"
 
 
@@ -218,17 +239,17 @@ class StackingVectorEnv(PlanningVectorEnv):
     def __init__(self, num_envs: int = 1, n_plates: int = 3, max_episode_steps: int | None = None) -> None:
         variation = self.variations.update({}, {"n_plates": n_plates})
         super().__init__(num_envs, _OBSERVATION_SPACE, spaces.Discrete(len(ACTION_NAMES)), variation, max_episode_steps)
-        self._state = np.zeros((num_envs, len(OBSERVATION_NAMES)), dtype=np.float32)
+        self._numbers = np.zeros((num_envs, len(OBSERVATION_NAMES)), dtype=np.float32)
         self._grippers = np.zeros((num_envs, 2), dtype=np.int64)
         self._n_plates = np.full(num_envs, n_plates)
         self._n_picked = np.zeros(num_envs, dtype=np.int64)
         self._plates: list[NDArray[np.int64]] = [np.zeros(0, dtype=np.int64)] * num_envs
 
     def _reset_rows(self, rows: NDArray[np.intp]) -> None:
-        self._state[rows] = 0
+        self._numbers[rows] = 0
         for row in rows:
             plates, gripper = draw_task(self._generators[row], self.row_variations[row])
-            self._state[row, plates] = DOMINANCE ** -np.arange(len(plates))
+            self._numbers[row, plates] = DOMINANCE ** -np.arange(len(plates))
             self._grippers[row] = divmod(gripper, N_SIDE)
             self._plates[row], self._n_plates[row] = plates, len(plates)
         self._n_picked[rows] = 0
@@ -240,27 +261,39 @@ class StackingVectorEnv(PlanningVectorEnv):
         self._show_grippers()
         above = self._grippers[:, 0] * N_SIDE + self._grippers[:, 1]
         picking = actions == PICK
-        picked = picking & (self._state[self._rows, above] == 1)
+        picked = picking & (self._numbers[self._rows, above] == 1)
         illegal = np.where(picking, ~picked, (self._grippers != moved).any(axis=1))
         rows = np.flatnonzero(picked)
-        self._state[rows, above[rows]] = 0
-        self._state[rows, :_STACK] *= DOMINANCE
+        self._numbers[rows, above[rows]] = 0
+        self._numbers[rows, :_STACK] *= DOMINANCE
         slots, n_plates = self._n_picked[rows], self._n_plates[rows]
-        self._state[rows, _STACK + slots] = (n_plates - slots) / n_plates
+        self._numbers[rows, _STACK + slots] = (n_plates - slots) / n_plates
         self._n_picked[rows] += 1
         rewards = np.where(illegal, STEP_REWARD + ILLEGAL_REWARD, STEP_REWARD) + PLATE_REWARD * picked
         return rewards, self._n_picked == self._n_plates
 
     def _show_grippers(self) -> None:
-        self._state[:, _GRIPPER:] = 2 * self._grippers / (N_SIDE - 1) - 1
+        self._numbers[:, _GRIPPER:] = 2 * self._grippers / (N_SIDE - 1) - 1
 
     def _observe(self) -> NDArray[np.float32]:
-        return self._state.copy()
+        return self._numbers.copy()
+
+    def _state_of(self, row: int) -> dict[str, Any]:
+        left = self._plates[row][self._n_picked[row] :]
+        plates = [list(divmod(cell, N_SIDE)) for cell in left.tolist()]
+        return {"n_plates": int(self._n_plates[row]), "plates": plates, "gripper": self._grippers[row].tolist()}
+
+    def _set_state_of(self, row: int, state: Mapping[str, Any]) -> None:
+        n_plates, plates, gripper = read_state(state)
+        n_picked, cells = n_plates - len(plates), [row * N_SIDE + column for row, column in plates]
+        self._n_picked[row], self._grippers[row] = n_picked, gripper
+        # Where the plates lay that are on the stack already does not matter.
+        self._plates[row] = np.array([-1] * n_picked + cells)
+        self._numbers[row] = 0
+        self._numbers[row, cells] = DOMINANCE ** -np.arange(len(cells))
+        self._numbers[row, _STACK : _STACK + n_picked] = (n_plates - np.arange(n_picked)) / n_plates
+        self._show_grippers()
 
     def _optimal_steps(self) -> NDArray[np.int64]:
-        return np.array(
-            [
-                planner.optimal_steps((row, column), [divmod(cell, N_SIDE) for cell in plates.tolist()])
-                for (row, column), plates in zip(self._grippers.tolist(), self._plates, strict=True)
-            ]
-        )
+        states = [self._state_of(row) for row in range(self.num_envs)]
+        return np.array([planner.optimal_steps(state["gripper"], state["plates"]) for state in states])

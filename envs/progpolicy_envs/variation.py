@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from numbers import Integral
@@ -70,10 +70,20 @@ class VariationSpace(Mapping[str, Parameter]):
     """The parameters of a domain, by name, in the order in which they are documented.
 
     :param parameters: the parameters
+    :param check: raises ``ValueError`` where the values of a whole variation do not fit together
+    :param starts: for each part of an episode's start that ``reset`` takes besides the parameters, its name and what it
+        is
     """
 
-    def __init__(self, *parameters: Parameter) -> None:
+    def __init__(
+        self,
+        *parameters: Parameter,
+        check: Callable[[Variation], None] | None = None,
+        starts: Mapping[str, str] | None = None,
+    ) -> None:
         self._parameters = {parameter.name: parameter for parameter in parameters}
+        self._check = check
+        self.starts = dict(starts or {})
 
     def __getitem__(self, name: str) -> Parameter:
         return self._parameters[name]
@@ -84,21 +94,40 @@ class VariationSpace(Mapping[str, Parameter]):
     def __len__(self) -> int:
         return len(self._parameters)
 
-    def update(self, variation: Mapping[str, Any], options: Mapping[str, Any] | None) -> Variation:
-        """Return ``variation`` with the values of ``options`` put in.
+    def split(self, options: Mapping[str, Any] | None) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return those of the options of a reset that change the variation, and those that are parts of a start.
+
+        :param options: as given to ``reset(options=...)``
+        :raises ValueError: if they are not a mapping
+        """
+        if options is None:
+            return {}, {}
+        if not isinstance(options, Mapping):
+            example = {next(iter(self)): 2}
+            raise ValueError(f"options={options!r} is not accepted; they are a mapping from names, such as {example}")
+        start = {name: value for name, value in options.items() if name in self.starts and value is not None}
+        return {name: value for name, value in options.items() if name not in self.starts}, start
+
+    def update(self, variation: Mapping[str, Any], changes: Mapping[str, Any] | None) -> Variation:
+        """Return ``variation`` with the values of ``changes`` put in.
 
         :param variation: the variation in force
-        :param options: new values by parameter name, as given to ``reset(options=...)``; ``None`` changes nothing
-        :raises ValueError: if a name is unknown or a value is not accepted; the message names the parameter, the
-            value and what is allowed
+        :param changes: new values by parameter name; ``None`` changes nothing
+        :raises ValueError: if a name is unknown, a value is not accepted, or the values do not fit together; the
+            message names the parameter, the value and what is allowed
         """
-        parsed = {name: self._named(name).parse(value) for name, value in (options or {}).items()}
-        return {**variation, **parsed}
+        parsed = {name: self._named(name).parse(value) for name, value in (changes or {}).items()}
+        updated = {**variation, **parsed}
+        if self._check:
+            self._check(updated)
+        return updated
 
     def _named(self, name: str) -> Parameter:
         if name not in self._parameters:
-            near = get_close_matches(str(name), self._parameters, n=1)
+            near = get_close_matches(str(name), [*self._parameters, *self.starts], n=1)
             hint = f" (did you mean {near[0]!r}?)" if near else ""
             known = "; ".join(f"{known.name}: {known.allowed}" for known in self._parameters.values())
+            once = "; ".join(f"{start}: {meaning}" for start, meaning in self.starts.items())
+            known += f"; for one episode: {once}" if once else ""
             raise ValueError(f"unknown variation parameter {name!r}{hint}; known: {known}")
         return self._parameters[name]

@@ -12,6 +12,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from progpolicy_envs.single import require_reset
+from progpolicy_envs.states import is_sequence
 from progpolicy_envs.variation import Variation, VariationSpace
 
 Infos = dict[str, Any]
@@ -61,6 +63,7 @@ class DomainVectorEnv(VectorEnv, ABC):
         self._elapsed = np.zeros(num_envs, dtype=np.int64)
         self._rows = np.arange(num_envs)
         self._generators: list[np.random.Generator] = [np.random.default_rng() for _ in range(num_envs)]
+        self._started = False
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
@@ -68,15 +71,29 @@ class DomainVectorEnv(VectorEnv, ABC):
         """Start a new episode in every environment.
 
         :param seed: environment ``i`` gets ``seed + i``, or ``seed[i]`` of a sequence; ``None`` keeps its generator
-        :param options: new variation values by name, each one value or a sequence of ``num_envs`` values
+        :param options: new variation values by name, each one value or a sequence of ``num_envs`` values; and parts of
+            the start of these episodes, in place of drawn ones, each a sequence with ``None`` where it is drawn
         :return: observations ``(num_envs, *observation)`` and infos of arrays with ``num_envs`` entries
-        :raises ValueError: if a variation is not accepted
+        :raises ValueError: if an option is not accepted; the variations in force are then unchanged, and if it was part
+            of a start, another reset is needed
         """
+        variations, starts = self._read_options(options)
         self._seed_rows(seed)
+        self._started = False
+        before, self.row_variations = self.row_variations, variations
         if options:
-            self._set_variations(options)
+            self._read_variations()
         self._elapsed[:] = 0
         self._reset_rows(self._rows)
+        try:
+            for row, start in enumerate(starts):
+                if start:
+                    self._set_start(row, start)
+        except ValueError:
+            self.row_variations = before
+            self._read_variations()
+            raise
+        self._started = True
         return self._observe(), self._reset_infos()
 
     def step(
@@ -88,6 +105,7 @@ class DomainVectorEnv(VectorEnv, ABC):
         :return: observations, rewards, terminated, truncated, infos
         :raises ValueError: if ``actions`` has the wrong shape or holds an action that is not accepted
         """
+        require_reset(self._started, "step()")
         rewards, terminated, infos = self._apply(self._checked(np.asarray(actions)))
         self._elapsed += 1
         truncated = (self._elapsed >= self.max_episode_steps) & ~terminated
@@ -108,6 +126,13 @@ class DomainVectorEnv(VectorEnv, ABC):
     @abstractmethod
     def _reset_rows(self, rows: NDArray[np.intp]) -> None:
         """Put the given environments into a starting state of their variation."""
+
+    def _read_variations(self) -> None:
+        """Read changed :attr:`row_variations`; for a subclass that keeps something that follows from them."""
+
+    @abstractmethod
+    def _set_start(self, row: int, start: Mapping[str, Any]) -> None:
+        """Replace parts of the start of one environment, which has just been reset."""
 
     @abstractmethod
     def _apply(self, actions: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.bool_], Infos]:
@@ -133,35 +158,53 @@ class DomainVectorEnv(VectorEnv, ABC):
             if row_seed is not None:
                 self._generators[row] = np.random.Generator(np.random.PCG64(np.random.SeedSequence(row_seed)))
 
-    def _set_variations(self, options: Mapping[str, Any]) -> None:
-        per_row = [dict[str, Any]() for _ in range(self.num_envs)]
-        for name, value in options.items():
-            values = list(value) if _is_per_row(value) else [value] * self.num_envs
-            if len(values) != self.num_envs:
-                raise ValueError(f"{name}: {len(values)} values given for {self.num_envs} environments")
-            for row, row_value in enumerate(values):
-                per_row[row][name] = row_value
-        self.row_variations = [
-            self.check_variation(self.variations.update(old, new))
-            for old, new in zip(self.row_variations, per_row, strict=True)
-        ]
+    def _read_options(self, options: Mapping[str, Any] | None) -> tuple[list[Variation], list[dict[str, Any]]]:
+        """Return the new variation of each environment, and the parts of its start that are given."""
+        changes, given = self.variations.split(options)
+        rows = [dict[str, Any]() for _ in range(self.num_envs)]
+        starts = [dict[str, Any]() for _ in range(self.num_envs)]
+        for name, value in changes.items():
+            for row, row_value in zip(rows, self._per_row(name, value), strict=True):
+                row[name] = row_value
+        for name, value in given.items():
+            if not is_sequence(value):
+                raise ValueError(f"{name}={value!r} is not accepted; a batch needs one for each environment, or None")
+            for start, row_value in zip(starts, self._per_row(name, value), strict=True):
+                if row_value is not None:
+                    start[name] = row_value
+        variations = [self.variations.update(old, new) for old, new in zip(self.row_variations, rows, strict=True)]
+        return variations, starts
 
-    @staticmethod
-    def check_variation(variation: Variation) -> Variation:
-        """Return ``variation``; a subclass raises ``ValueError`` where its values do not fit together."""
-        return variation
+    def _per_row(self, name: str, value: Any) -> list[Any]:
+        """Return the values of an option that are given for all environments at once, or one for each."""
+        values = list(value) if is_sequence(value) else [value] * self.num_envs
+        if len(values) != self.num_envs:
+            raise ValueError(f"{name}: {len(values)} values given for {self.num_envs} environments")
+        return values
 
 
 class PlanningVectorEnv(DomainVectorEnv):
     """N environments of a planning domain, stepped by array operations.
 
     A subclass keeps its state in arrays whose first axis is the environment and implements :meth:`_reset_rows`,
-    :meth:`_move`, :meth:`_observe` and :meth:`_optimal_steps`.
+    :meth:`_move`, :meth:`_observe`, :meth:`_state_of`, :meth:`_set_state_of` and :meth:`_optimal_steps`.
     """
 
     def optimal_steps(self) -> NDArray[np.int64]:
         """Return how many steps the planner needs from each environment's present state, ``(num_envs,)``."""
+        require_reset(self._started, "optimal_steps()")
         return self._optimal_steps()
+
+    def _set_start(self, row: int, start: Mapping[str, Any]) -> None:
+        self._set_state_of(row, {**self._state_of(row), **start})
+
+    @abstractmethod
+    def _state_of(self, row: int) -> dict[str, Any]:
+        """Return the state of one environment, as the single form does."""
+
+    @abstractmethod
+    def _set_state_of(self, row: int, state: Mapping[str, Any]) -> None:
+        """Check a whole state and put one environment into it."""
 
     @abstractmethod
     def _move(self, actions: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -186,11 +229,6 @@ class PlanningVectorEnv(DomainVectorEnv):
 
     def _reset_infos(self) -> Infos:
         return {**super()._reset_infos(), "optimal_steps": self._optimal_steps()}
-
-
-def _is_per_row(value: Any) -> bool:
-    """Return whether an option is a sequence with a value for each environment, rather than one value for all."""
-    return isinstance(value, Sequence | np.ndarray) and not isinstance(value, str) and getattr(value, "ndim", 1) > 0
 
 
 def check_num_envs(num_envs: int) -> None:

@@ -38,7 +38,8 @@ class _ObjectsEnv(PandaEnv):
     """What the three environments with objects have in common."""
 
     variations: ClassVar[VariationSpace] = VariationSpace(
-        IntParameter("n_objects", 1, MAX_OBJECTS, "number of objects")
+        IntParameter("n_objects", 1, MAX_OBJECTS, "number of objects"),
+        starts={"starts": "x and y of each object, metres", "targets": "x and y of each target, metres"},
     )
 
     def __init__(
@@ -79,7 +80,8 @@ class PandaReachEnv(PandaEnv):
 
     ## Starting State
     The arm in its neutral pose, the gripper near (0.04, 0, 0.2), fingers closed. Targets by seed in a box of 33 x
-    50 x 30 cm, at least 10 cm apart and from the gripper.
+    50 x 30 cm, at least 10 cm apart and from the gripper. ``env.reset(options={"targets": [[0.1, 0.2, 0.3]]})`` gives
+    them instead, in metres; ``env.unwrapped.start`` is what the present episode started with, in this form.
 
     ## Episode End
     Terminated when the last target is visited; truncated after 500 steps (``max_episode_steps``).
@@ -89,7 +91,8 @@ class PandaReachEnv(PandaEnv):
 
     task_class: ClassVar[type[Task]] = Reach
     variations: ClassVar[VariationSpace] = VariationSpace(
-        IntParameter("n_targets", 1, MAX_OBJECTS, "number of targets")
+        IntParameter("n_targets", 1, MAX_OBJECTS, "number of targets"),
+        starts={"targets": "x, y and z of each target, metres"},
     )
     controller: ClassVar[Callable[[FlatObservation], Action]] = staticmethod(controllers.reach)
 
@@ -137,6 +140,8 @@ class PandaPushEnv(_ObjectsEnv):
     The arm in its neutral pose, fingers closed. Blocks and targets by seed, in reach, at least 9 cm apart from
     their like, 10 to 35 cm from block to target; taken in colour order every straight way, with a run-up of 8 cm,
     is 8 cm clear of the other blocks.
+
+    $start
 
     ## Episode End
     Terminated when every object is finished, or as a failure when one leaves the table; truncated after 500 steps
@@ -186,6 +191,8 @@ class PandaSlideEnv(_ObjectsEnv):
     in colour order; targets at x from 0.3 to 0.54, at most 22 degrees off the x axis as seen from their pucks;
     taken in colour order every straight way is 8 cm clear of the other pucks.
 
+    $start
+
     ## Episode End
     Terminated when every object is finished, or as a failure when one leaves the table; truncated after 500 steps
     (``max_episode_steps``).
@@ -232,6 +239,8 @@ class PandaStackEnv(_ObjectsEnv):
     ## Starting State
     The arm in its neutral pose, fingers closed. The tower's place by seed, x from -0.02 to 0.08, y from -0.12 to
     0.12; blocks by seed where the gripper can pick them up without touching the tower or another block.
+
+    $start In a tower all targets have the same x and y.
 
     ## Episode End
     Terminated when every object is finished, or as a failure when one leaves the table; truncated after 500 steps

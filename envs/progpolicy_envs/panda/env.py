@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
@@ -16,8 +15,9 @@ from progpolicy_envs.panda.focus import ACTION_NAMES, BOUND, OBSERVATION_NAMES, 
 from progpolicy_envs.panda.physics import CONTROL_STEP, ObjectState, Physics
 from progpolicy_envs.panda.scene import Scene
 from progpolicy_envs.panda.tasks import Task
-from progpolicy_envs.rendering import Display
-from progpolicy_envs.variation import VariationSpace
+from progpolicy_envs.rendering import Frame
+from progpolicy_envs.single import DomainEnv, require_reset
+from progpolicy_envs.variation import Variation, VariationSpace
 
 FlatObservation = NDArray[np.float32]
 Observation = FlatObservation | dict[str, NDArray[np.float32]]
@@ -42,7 +42,7 @@ def check_choice(name: str, value: Any, choices: Sequence[Any]) -> None:
         raise ValueError(f"{name}={value!r} is not accepted; {name} is one of {allowed}")
 
 
-class PandaEnv(gym.Env[Any, Action]):
+class PandaEnv(DomainEnv):
     """What the Panda environments have in common; see :class:`~progpolicy_envs.panda.PandaPushEnv` and the others.
 
     A subclass names its :attr:`task_class`, its one variation parameter and its :attr:`controller`.
@@ -66,39 +66,14 @@ class PandaEnv(gym.Env[Any, Action]):
     ) -> None:
         check_choice("reward_type", reward_type, ("dense", "sparse"))
         check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
-        self.variation = self.variations.update({}, variation)
+        super().__init__(variation, render_mode)
         self.reward_type = reward_type
-        self.render_mode = render_mode
         self.action_space = spaces.Box(-1.0, 1.0, (len(ACTION_NAMES),), np.float32)
         self.observation_space: spaces.Space[Any] = bounded_box(len(OBSERVATION_NAMES))
         self.task = self.task_class()
         self.scene = Scene(self.task.table, self.task.kind, physics, visual=render_mode is not None)
         self._camera = Camera(self.scene, self.task) if render_mode is not None else None
-        self._display = Display(self.metadata["render_fps"])
         self._approach_distance = 0.0
-
-    @property
-    def size(self) -> int:
-        """Number of objects, or of targets in Reach."""
-        return int(next(iter(self.variation.values())))
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Put the robot into its neutral pose and draw new starts and targets.
-
-        :param seed: seeds the generator from which all positions come; ``None`` goes on with it
-        :param options: new values of variation parameters; they stay in force
-        :return: observation and info
-        :raises ValueError: if a variation is not accepted; the variation in force is then unchanged
-        """
-        variation = self.variations.update(self.variation, options)
-        super().reset(seed=seed)
-        self.variation = variation
-        self.task.reset(self.scene, self.np_random, self.size)
-        self._update_focus()
-        self._show()
-        return self._observe(), {"is_success": False, "variation": dict(self.variation)}
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Apply one action for 1/30 s.
@@ -107,6 +82,7 @@ class PandaEnv(gym.Env[Any, Action]):
         :return: observation, reward, terminated, truncated, info
         :raises ValueError: if the action has another shape or a number that is not finite
         """
+        require_reset(self._started, "step()")
         action = np.asarray(action, dtype=np.float32)
         numbers = action.tolist()
         if action.shape != (len(ACTION_NAMES),) or not all(map(math.isfinite, numbers)):
@@ -147,26 +123,59 @@ class PandaEnv(gym.Env[Any, Action]):
         return observation, self._reward(observation, info), info
 
     def plan(self) -> Iterator[Action]:
-        """Yield the scripted controller's actions, each for the state in which the environment then is.
+        """Return an iterator of the scripted controller's actions, each for the state in which the environment then is.
 
         ``for action in env.unwrapped.plan(): env.step(action)`` solves the task, as in every environment of this
         package. It ends when the task is done or has failed; where the number of steps is limited, stop at
         ``truncated``.
         """
-        while self._n_left and not self.task.failed:
-            yield type(self).controller(self._flat_observation())
+        require_reset(self._started, "plan()")
+        return self._planned()
+
+    @property
+    def start(self) -> dict[str, Any]:
+        """How the episode started, as data that JSON can hold; ``reset(options=...)`` takes it to start another so."""
+        require_reset(self._started, "start")
+        start = {"starts": self.task.starts, "targets": self.task.targets}
+        places = {name: [list(place) for place in start[name]] for name in self.variations.starts}
+        return {next(iter(self.variations)): len(self.task.targets), **places}
+
+    def replace_start(self, start: Mapping[str, Any]) -> Observation:
+        """Begin the episode once more with other starts or targets.
+
+        :param start: ``starts``, ``targets`` or both; see the class
+        :return: the observation
+        :raises ValueError: if they are not accepted
+        """
+        task = self.task
+        given = {"starts": task.starts, "targets": task.targets, **start}
+        task.place(self.scene, *task.read_start(len(task.targets), given["starts"], given["targets"]))
+        self._update_focus()
+        return self._observe()
 
     def render(self) -> Any:
         """Return a picture ``(360, 480, 3)`` of bytes, or show a window, as ``render_mode`` says."""
-        if self._camera is not None and self.render_mode == "rgb_array":
-            return self._camera.frame(self._focus)
+        require_reset(self._started, "render()")
+        if self.render_mode == "rgb_array":
+            return self._frame()
         self._show()
         return None
 
     def close(self) -> None:
         """Leave PyBullet and close the window, if there is one."""
         self.scene.close()
-        self._display.close()
+        super().close()
+
+    def _planned(self) -> Iterator[Action]:
+        while self._n_left and not self.task.failed:
+            yield type(self).controller(self._flat_observation())
+
+    def _start(self, variation: Variation, start: Mapping[str, Any]) -> None:
+        (size,) = variation.values()
+        self.task.place(self.scene, *self.task.sample(self.np_random, size))
+        self._update_focus()
+        if start:
+            self.replace_start(start)
 
     def _reward(self, observation: Any, info: Mapping[str, Any]) -> float:
         """Return the reward of the present step."""
@@ -203,6 +212,5 @@ class PandaEnv(gym.Env[Any, Action]):
     def _observe(self) -> Observation:
         return self._flat_observation()
 
-    def _show(self) -> None:
-        if self.render_mode == "human" and self._camera is not None:
-            self._display.show(self._camera.frame(self._focus))
+    def _frame(self) -> Frame | None:
+        return self._camera.frame(self._focus) if self._camera is not None else None

@@ -1,13 +1,15 @@
-"""Seeded starting positions that can be solved: apart from each other, in reach, with a free way to the target."""
+"""Starting positions: seeded ones that can be solved, apart, in reach and with a free way, and those of a user."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from progpolicy_envs.panda.physics import ObjectKind, Table
 from progpolicy_envs.panda.robot import BASE_POSITION
 
 Points = NDArray[np.float64]
@@ -23,6 +25,8 @@ _BATCH = 64
 _BATCHES = 8
 #: With so many objects placed, most candidates do not fit and are screened from the first batch on.
 _CROWDED = 4
+#: Objects nearer than this to the middle of the robot's base would touch it, metres.
+_BASE_RADIUS = 0.15
 
 
 def sample_in_order(
@@ -131,3 +135,47 @@ def all_within(starts: Points, ends: Points, least: float, most: float) -> NDArr
     ways = ends - starts
     distances = np.hypot(ways[:, 0], ways[:, 1])
     return (least < distances) & (distances < most)
+
+
+def read_points(name: str, value: Any, heights: Points) -> Points:
+    """Return places that a user gives, ``(n, 3)``.
+
+    :param name: of what is given, for the error
+    :param value: x and y of each, or x, y and z, metres
+    :param heights: z of each, ``(n,)``; NaN where z has to be given and can be any
+    :raises ValueError: if they are not of that form
+    """
+    free = np.isnan(heights)
+    try:
+        points = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        points = np.zeros(0)
+    if points.shape == (len(heights), 2) and not free.any():
+        points = np.column_stack((points, heights))
+    fits = points.shape == (len(heights), 3) and np.isfinite(points).all()
+    if not fits or not (free | np.isclose(points[:, 2], heights, rtol=0, atol=1e-6)).all():
+        form = "x, y and z" if free.any() else f"x and y, and z, if it is given, is {heights.tolist()}"
+        raise ValueError(f"{name}={value!r} is not accepted; {name} are {len(heights)} places in metres, each {form}")
+    return points
+
+
+def check_on_table(name: str, points: Points, table: Table) -> None:
+    """Raise ``ValueError`` if a place is not on the table, or where the robot stands."""
+    for x, y, _ in points.tolist():
+        if not (table.low_x <= x <= table.high_x and abs(y) <= table.width / 2):
+            raise ValueError(
+                f"{name}: ({x}, {y}) is not accepted; on the table x is from {table.low_x} to {table.high_x} and y "
+                f"from {-table.width / 2} to {table.width / 2}"
+            )
+        if math.hypot(x - BASE_POSITION[0], y - BASE_POSITION[1]) < _BASE_RADIUS:
+            raise ValueError(f"{name}: ({x}, {y}) is not accepted; the robot stands there")
+
+
+def check_apart(name: str, points: Points, kind: ObjectKind) -> None:
+    """Raise ``ValueError`` if objects at these places would overlap."""
+    width, depth, _ = (2 * half for half in kind.half_extents)
+    for index, (x, y, _) in enumerate(points.tolist()):
+        for other, (other_x, other_y, _) in enumerate(points[:index].tolist()):
+            way_x, way_y = abs(x - other_x), abs(y - other_y)
+            if math.hypot(way_x, way_y) < width if kind.shape == "cylinder" else way_x < width and way_y < depth:
+                raise ValueError(f"{name}: objects {other} and {index} overlap; they are {width} m wide")

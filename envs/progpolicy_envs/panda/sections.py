@@ -46,11 +46,16 @@ SECTIONS = {
 
         Progress is measured as a difference, so that nothing is gained by moving to and fro.
         """,
+    "start": """
+        ``env.reset(options={"n_objects": 1, "starts": [[-0.1, 0.1]], "targets": [[0.0, -0.1]]})`` gives them instead,
+        as x and y in metres; whether the task can then be solved is not checked. ``env.unwrapped.start`` is what the
+        present episode started with, in this form.
+        """,
     "rules": """
         ## Information
         ``info["is_success"]`` at every step; at reset also ``info["variation"]``. Steps also carry ``is_failure`` and
         what ``compute_reward`` of the goal form needs besides the goals: ``settled``, ``previous_achieved_goal``,
-        ``shaping``. ``env.unwrapped.plan()`` yields the actions of a scripted controller.
+        ``shaping``. ``env.unwrapped.plan()`` iterates over the actions of a scripted controller.
 
         ## Arguments
         ``gym.make("$id", $size=5)`` or ``env.reset(options={"$size": 5})``; an option stays in force until it is

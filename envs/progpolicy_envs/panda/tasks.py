@@ -1,12 +1,10 @@
-"""The four tasks: where things start, when an object is finished, where the gripper has to be, what pictures show."""
+"""The four tasks: reach, push, slide and stack."""
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,110 +21,12 @@ from progpolicy_envs.panda.placement import (
     corridor_distances,
     extended,
     reachable,
+    read_points,
     sample_in_order,
 )
 from progpolicy_envs.panda.robot import BASE_POSITION
-from progpolicy_envs.panda.scene import FALL_DEPTH, Scene
-
-
-@dataclass(frozen=True)
-class Mark:
-    """A shape that pictures show for each object, in the object's colour, and that nothing in the world touches.
-
-    :param shape: ``"sphere"``, ``"box"`` or ``"drum"``, which is an upright cylinder
-    :param half_extents: half the size along x, y and z, metres; a radius is the first
-    :param pale: whether the colour is made lighter
-    """
-
-    shape: Literal["sphere", "box", "drum"]
-    half_extents: tuple[float, float, float]
-    pale: bool = False
-
-
-_DISC = Mark("drum", (0.05, 0.05, 0.001), pale=True)
-
-
-class Task(ABC):
-    """One task and its state in the running episode.
-
-    ``positions`` (of what has to come to the targets), ``targets`` and ``finished`` have one entry per object. They are
-    read at every step, so they are lists of plain floats, which are faster than small arrays.
-    """
-
-    table: ClassVar[Table] = Table()
-    kind: ClassVar[ObjectKind | None] = None
-    #: Distance from the target within which an object counts as there, metres.
-    tolerance: ClassVar[float] = 0.05
-    #: What pictures show of each object besides itself; the first shows its target.
-    marks: ClassVar[tuple[Mark, ...]] = (_DISC,)
-
-    def __init__(self) -> None:
-        self.positions: list[Point] = []
-        self.targets: list[Point] = []
-        self.finished: list[bool] = []
-
-    def reset(self, scene: Scene, rng: np.random.Generator, n_objects: int) -> None:
-        """Draw starts and targets and place the objects.
-
-        :param scene: the world
-        :param rng: the only source of chance
-        :param n_objects: how many objects, or targets of Reach
-        """
-        starts, targets = self.sample(rng, n_objects)
-        scene.place([tuple(start) for start in starts.tolist()])
-        self.targets = [tuple(target) for target in targets.tolist()]
-        self.finished = [False] * n_objects
-        self.positions = self._positions(scene)
-
-    def update(self, scene: Scene) -> None:
-        """Read the state of the world after a control step."""
-        self.positions = self._positions(scene)
-        self.finished = self._finished(scene)
-
-    @property
-    def focus(self) -> int:
-        """Index of the first unfinished object in colour order; the last one when all are finished."""
-        return self.finished.index(False) if False in self.finished else len(self.finished) - 1
-
-    @property
-    def failed(self) -> bool:
-        """Whether an object has left the table."""
-        for position in self.positions:  # noqa: SIM110 - a generator costs more in what every step does
-            if position[2] < -FALL_DEPTH:
-                return True
-        return False
-
-    def settled(self, scene: Scene, index: int) -> bool:
-        """Return whether an object would be finished if it were at its target: whether all other conditions hold."""
-        return True
-
-    @abstractmethod
-    def sample(self, rng: np.random.Generator, n_objects: int) -> tuple[Points, Points]:
-        """Return starts (``(n, 3)``; ``(0, 3)`` for Reach) and targets ``(n, 3)``."""
-
-    @abstractmethod
-    def approach_point(self, index: int) -> Point | None:
-        """Return the point from which the gripper moves an object; ``None`` where there is none."""
-
-    def mark_positions(self, index: int) -> tuple[Point | None, ...]:
-        """Return where pictures show each of an object's :attr:`marks`; ``None`` for one that they do not show."""
-        x, y, _ = self.targets[index]
-        return ((x, y, 0.001),)
-
-    def pin_positions(self, index: int) -> tuple[Point | None, ...]:
-        """Return the points over which pictures show a pin while an object is in focus."""
-        return self.mark_positions(index)[0], self.positions[index]
-
-    def _positions(self, scene: Scene) -> list[Point]:
-        return scene.positions
-
-    def _finished(self, scene: Scene) -> list[bool]:
-        """Return which objects are finished, given which were before and where all are now."""
-        tolerance = self.tolerance
-        return [
-            math.dist(position, target) < tolerance
-            for position, target in zip(self.positions, self.targets, strict=True)
-        ]
+from progpolicy_envs.panda.scene import Scene
+from progpolicy_envs.panda.task import DISC, Mark, Task
 
 
 class Reach(Task):
@@ -151,6 +51,19 @@ class Reach(Task):
     def approach_point(self, index: int) -> Point | None:
         """Return ``None``: the gripper itself is what moves."""
         return None
+
+    def read_start(self, n_objects: int, starts: Any, targets: Any) -> tuple[Points, Points]:
+        """Return no starts, and targets that a user gives.
+
+        :param n_objects: how many targets
+        :param starts: not used
+        :param targets: x, y and z of each target, metres
+        :raises ValueError: if they are not of that form, or below the table's top
+        """
+        points = read_points("targets", targets, np.full(n_objects, np.nan))
+        if (points[:, 2] < 0).any():
+            raise ValueError(f"targets={points.tolist()} are not accepted; z is above the table, at least 0")
+        return np.zeros((0, 3)), points
 
     def mark_positions(self, index: int) -> tuple[Point | None, ...]:
         """Return the target, until it has been visited."""
@@ -232,7 +145,7 @@ class Slide(Task):
 
     table = Table(low_x=-0.8, high_x=0.6)
     kind = ObjectKind("cylinder", (0.03, 0.03, 0.015), mass=1.0, friction=0.04)
-    marks = (_DISC, Mark("drum", kind.half_extents))
+    marks = (DISC, Mark("drum", kind.half_extents))
     clearance = 0.08
     run_up = 0.06
     #: Half axes of the ellipse around a puck in which no other starts; longer along x, the way to the targets.
@@ -344,13 +257,25 @@ class Stack(Task):
             )
 
         starts, targets = _on_table(*sample_in_order(n_objects, propose, fits), height=self.kind.height)
-        targets[:, 2] += 2 * self.kind.height * np.arange(n_objects)
+        targets[:, 2] = self.target_heights(n_objects)
         return starts, targets
 
-    def reset(self, scene: Scene, rng: np.random.Generator, n_objects: int) -> None:
-        """Draw starts and the tower's place and place the blocks."""
-        super().reset(scene, rng, n_objects)
+    def place(self, scene: Scene, starts: Points, targets: Points) -> None:
+        """Begin an episode: put the robot and the blocks into the world."""
+        super().place(scene, starts, targets)
         self._before = self.positions
+
+    def target_heights(self, n_objects: int) -> Points:
+        """Return the heights of the blocks in the tower, metres, ``(n,)``."""
+        height = self.kind.height
+        return np.array([height + 2 * height * level for level in range(n_objects)])
+
+    def read_start(self, n_objects: int, starts: Any, targets: Any) -> tuple[Points, Points]:
+        """Return starts and targets as :meth:`Task.read_start` does; the targets have one x and one y, the tower's."""
+        starts, targets = super().read_start(n_objects, starts, targets)
+        if (targets[:, :2] != targets[0, :2]).any():
+            raise ValueError(f"targets={targets.tolist()} are not accepted; x and y of a tower are the same in all")
+        return starts, targets
 
     def update(self, scene: Scene) -> None:
         """Read the state of the world after a control step."""

@@ -6,6 +6,7 @@ computes the physics of all simulations, then reads all of them.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -104,6 +105,9 @@ class PandaVectorEnv(DomainVectorEnv):
             env = self.envs[row]
             env.np_random = self._generators[row]
             self._observations[row] = env.reset(options=dict(self.row_variations[row]))[0]
+
+    def _set_start(self, row: int, start: Mapping[str, Any]) -> None:
+        self._observations[row] = self.envs[row].replace_start(start)
 
 
 class PandaReachVectorEnv(PandaVectorEnv):

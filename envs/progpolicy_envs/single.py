@@ -1,0 +1,85 @@
+"""What the single environments have in common: variations, starts that are given, and reset before all else."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import gymnasium as gym
+from gymnasium.error import ResetNeeded
+
+from progpolicy_envs.rendering import Display
+from progpolicy_envs.variation import Variation, VariationSpace
+
+
+def require_reset(started: bool, call: str) -> None:
+    """Raise :class:`gymnasium.error.ResetNeeded` unless an episode has been started."""
+    if not started:
+        raise ResetNeeded(f"{call} needs an episode; call reset() first")
+
+
+class DomainEnv(gym.Env[Any, Any], ABC):
+    """One environment of a task domain.
+
+    :param variation: the variation in force
+    :param render_mode: one of those in ``metadata``, or ``None``
+    :raises ValueError: if the variation is not accepted
+    """
+
+    variations: ClassVar[VariationSpace]
+
+    def __init__(self, variation: Mapping[str, Any], render_mode: str | None = None) -> None:
+        self.variation: Variation = self.variations.update({}, variation)
+        self.render_mode = render_mode
+        self._display = Display(self.metadata["render_fps"])
+        self._started = False
+
+    def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode.
+
+        :param seed: seeds the generator from which everything random is drawn; ``None`` goes on with it
+        :param options: new values of variation parameters, which stay in force, and parts of the start of this one
+            episode, in place of drawn ones; see the class
+        :return: observation and info
+        :raises ValueError: if an option is not accepted; the variation in force is then unchanged, and if it was part
+            of a start, another reset is needed
+        """
+        changes, start = self.variations.split(options)
+        variation = self.variations.update(self.variation, changes)
+        super().reset(seed=seed)
+        self._started = False
+        self._start(variation, start)
+        self.variation = variation
+        self._started = True
+        self._show()
+        return self._observe(), {"is_success": False, "variation": dict(variation), **self._reset_info()}
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self._display.close()
+
+    def _show(self) -> None:
+        """Show the state in the window; to be called after each change of it."""
+        if self.render_mode == "human":
+            self._display.show(self._frame())
+
+    def _reset_info(self) -> dict[str, Any]:
+        """Return what the info of a reset has besides the variation."""
+        return {}
+
+    @abstractmethod
+    def _start(self, variation: Variation, start: Mapping[str, Any]) -> None:
+        """Put the environment into a starting state.
+
+        :param variation: of the episode
+        :param start: parts of it that are given; all others are drawn
+        """
+
+    @abstractmethod
+    def _observe(self) -> Any:
+        """Return the observation."""
+
+    @abstractmethod
+    def _frame(self) -> Any:
+        """Draw the state, ``(height, width, 3)`` bytes."""
