@@ -24,7 +24,8 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> None
             os.fsync(handle.fileno())
         os.replace(temporary, target)
     except OSError as error:
-        error.filename, error.filename2 = str(target), None
+        if error.errno is not None:  # the system's error; it names the temporary file
+            error.filename, error.filename2 = str(target), None
         raise
     finally:
         temporary.unlink(missing_ok=True)
