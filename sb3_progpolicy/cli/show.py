@@ -43,7 +43,7 @@ def show(
             raise ValueError(f"{run_or_name} is not a program; ProgPolicy and PRLPolicy learn programs")
         content = _printed(source.program, format_)
     if output is None and isinstance(content, bytes):
-        output = Path(f"{_file_stem(source.env_id)}.png")
+        output = Path(_file_stem(source.program.metadata.get("env")) + ".png")
     if output is None:
         typer.echo(content, nl=False)
     else:
