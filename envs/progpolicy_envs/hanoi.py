@@ -308,17 +308,16 @@ class HanoiVectorEnv(PlanningVectorEnv):
         self._tops[rows] = self._TOP[self._bits[rows]]
 
     def _move(self, actions: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        rows, source, target = self._rows, self._FROM[actions], self._TO[actions]
-        moved, under = self._tops[rows, source], self._tops[rows, target]
+        pegs = N_PEGS * self._rows
+        source, target = pegs + self._FROM[actions], pegs + self._TO[actions]
+        bits, tops = self._bits.reshape(-1), self._tops.reshape(-1)  # views
+        moved, under = tops[source], tops[target]
         legal = moved < under
         disc = np.where(legal, 1 << moved, 0)
-        left = self._bits[rows, source] ^ disc
-        grown = self._bits[rows, target] ^ disc
-        self._bits[rows, source] = left
-        self._bits[rows, target] = grown
-        self._tops[rows, source] = self._TOP[left]
-        self._tops[rows, target] = self._TOP[grown]
-        solved = self._bits[rows, self._target] == self._full
+        left, grown = bits[source] ^ disc, bits[target] ^ disc
+        bits[source], bits[target] = left, grown
+        tops[source], tops[target] = self._TOP[left], self._TOP[grown]
+        solved = bits[pegs + self._target] == self._full
         rewards = np.where(legal, STEP_REWARD, STEP_REWARD + ILLEGAL_REWARD) + GOAL_REWARD * solved
         return rewards, solved
 

@@ -240,14 +240,12 @@ def check_num_envs(num_envs: int) -> None:
 def _final(observations: Any, infos: Infos, done: NDArray[np.bool_], ended: NDArray[np.intp]) -> Infos:
     """Return the last observations and infos of the episodes that have ended; masks ``_name`` say which have."""
     final_obs = np.full(len(done), None, dtype=object)
-    for row in ended:
-        final_obs[row] = _of_row(observations, int(row))
+    if isinstance(observations, dict):
+        last = {key: values[ended] for key, values in observations.items()}
+        for i, row in enumerate(ended.tolist()):
+            final_obs[row] = {key: values[i] for key, values in last.items()}
+    else:
+        for row, observation in zip(ended.tolist(), observations[ended], strict=True):
+            final_obs[row] = observation
     final_info = {**infos, **{f"_{name}": done for name in infos}}
     return {"final_obs": final_obs, "_final_obs": done, "final_info": final_info, "_final_info": done}
-
-
-def _of_row(observations: Any, row: int) -> Any:
-    """Return a copy of one environment's observation."""
-    if isinstance(observations, dict):
-        return {key: values[row].copy() for key, values in observations.items()}
-    return observations[row].copy()

@@ -327,8 +327,10 @@ class ReptilePPO(SequencePPO):
         self.outer_optimizer.drop(names.index("module.search.logits"))
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Any = None) -> None:
-        super()._update_info_buffer(infos, dones)
-        self._statistics.add(self._task.indices, dones, infos)
+        ended = np.flatnonzero(dones)  # no other info is read
+        if len(ended):
+            super()._update_info_buffer([infos[row] for row in ended], dones[ended])
+            self._statistics.add(self._task.indices, dones, infos)
 
     # --------------------------------------------------------------------------------------------- the program
 

@@ -160,7 +160,6 @@ class SamplerActor:
         """See :class:`Actor`."""
         return RNNStates(self.sampler.state, self.sampler.state) if self.recurrent else None
 
-    @th.no_grad()
     def act(self, observations: NDArray[np.generic], step: int) -> NDArray[np.generic]:
         """See :class:`Actor`."""
         features = np.asarray(observations, dtype=np.float32)
