@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 from typing import Any, cast
 
@@ -95,6 +96,9 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
                 f"features_extractor_class={extractor.__name__} is not accepted; a program reads what it is printed to "
                 "read. FlattenExtractor is accepted, and NormalizingExtractor, which is folded into the program"
             )
+        if isinstance(net_arch, list) and net_arch and isinstance(net_arch[0], dict):
+            warnings.warn(f"net_arch={net_arch} is SB3's form before 1.8; give the dict without a list", stacklevel=2)
+            net_arch = net_arch[0]
         if isinstance(net_arch, dict):
             if net_arch.get("pi"):
                 raise ValueError(f"net_arch={net_arch} is not accepted; the actor is a program, 'vf' is the critic's")

@@ -133,7 +133,7 @@ def test_plain_observations_and_reset_tuples_are_explained():
     model, env = ReptilePPO("ProgPolicy", "Hanoi-v0", n_envs=1, **SMALL), gym.make("Hanoi-v0")
     with pytest.raises(ValueError, match="InteractionHistory"):
         model.predict(env.reset()[0])
-    with pytest.raises(ValueError, match="pass the first of it"):
+    with pytest.raises(ValueError, match="mixing Gym API"):  # the words of SB3's own error
         model.predict(InteractionHistory(env).reset())
 
 
@@ -156,6 +156,12 @@ def test_architecture_of_the_actor_is_refused_and_that_of_the_critic_taken():
     with pytest.raises(ValueError, match="the actor is a program"):
         PPO(ProgrammaticPolicy, "CartPole-v1", policy_kwargs={"net_arch": {"pi": [8], "vf": [8]}})
     model = PPO(ProgrammaticPolicy, "CartPole-v1", policy_kwargs={"net_arch": {"vf": [7]}})
+    assert model.policy.value_net.in_features == 7
+
+
+def test_architecture_in_the_form_of_old_sb3_is_taken_with_a_warning():
+    with pytest.warns(UserWarning, match="without a list"):
+        model = PPO(ProgrammaticPolicy, "CartPole-v1", policy_kwargs={"net_arch": [{"vf": [7]}]})
     assert model.policy.value_net.in_features == 7
 
 

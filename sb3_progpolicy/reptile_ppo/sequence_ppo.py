@@ -296,8 +296,9 @@ class SequencePPO(PPO):
     def _check_observation(self, observation: Any) -> None:
         if isinstance(observation, tuple):
             raise ValueError(
-                "a tuple is not an observation; Gymnasium's reset() returns (observation, info): pass the first of it. "
-                "model.get_env() gives an environment whose reset() returns observations alone"
+                "a tuple is not an observation. You are probably mixing Gym API with SB3's VecEnv API: Gymnasium's "
+                "reset() returns (observation, info), of which the first is to be passed; model.get_env() gives an "
+                "environment whose reset() returns observations alone"
             )
         expected = self.observation_space.shape
         if len(expected or ()) != 1 or np.ndim(observation) not in (1, 2) or np.shape(observation)[-1:] == expected:
