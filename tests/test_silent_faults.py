@@ -9,6 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
@@ -163,6 +164,20 @@ def test_architecture_in_the_form_of_old_sb3_is_taken_with_a_warning():
     with pytest.warns(UserWarning, match="without a list"):
         model = PPO(ProgrammaticPolicy, "CartPole-v1", policy_kwargs={"net_arch": [{"vf": [7]}]})
     assert model.policy.value_net.in_features == 7
+
+
+def test_dict_observations_are_refused_by_name():
+    env = gym.Env()
+    env.observation_space, env.action_space = spaces.Dict({"a": spaces.Box(-1, 1, (2,))}), spaces.Discrete(2)
+    with pytest.raises(ValueError, match=r"Dict.* is not accepted.*FlattenObservation"):
+        ReptilePPO(MultiInputActorCriticPolicy, env, interaction_history=False, **SMALL)
+
+
+def test_rollouts_are_collected_outside_of_learning_as_in_sb3():
+    model = ReptilePPO("ProgPolicy", "CartPole-v1", n_envs=4, **{**SMALL, "n_steps": 64})
+    _, callback = model._setup_learn(total_timesteps=256)
+    assert model.collect_rollouts(model.get_env(), callback, model.rollout_buffer, model.n_steps)
+    assert len(model.ep_info_buffer) > 0
 
 
 def test_discrete_observations_fill_the_buffer():

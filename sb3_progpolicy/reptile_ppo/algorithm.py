@@ -219,6 +219,7 @@ class ReptilePPO(SequencePPO):
 
     def _setup_model(self) -> None:
         super()._setup_model()  # lines 1-2: the derivation graph, its W at even odds, and phi
+        self._statistics: EpisodeStatistics | None = None
         self.outer_optimizer = MetaOptimizer(self.meta_optimizer)
 
     # ---------------------------------------------------------------------------------------------- algorithm 1
@@ -330,7 +331,8 @@ class ReptilePPO(SequencePPO):
         ended = np.flatnonzero(dones)  # no other info is read
         if len(ended):
             super()._update_info_buffer([infos[row] for row in ended], dones[ended])
-            self._statistics.add(self._task.indices, dones, infos)
+            if self._statistics is not None:  # SB3 lets collect_rollouts be called outside learn, without a task
+                self._statistics.add(self._task.indices, dones, infos)
 
     # --------------------------------------------------------------------------------------------- the program
 

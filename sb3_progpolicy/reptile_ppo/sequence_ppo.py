@@ -67,6 +67,11 @@ class SequencePPO(PPO):
         super().__init__(policy, env, **ppo)  # type: ignore[arg-type]
 
     def _setup_model(self) -> None:
+        if isinstance(self.observation_space, spaces.Dict):
+            raise ValueError(
+                f"observation space {self.observation_space} is not accepted; {type(self).__name__} reads arrays. "
+                "Wrap the environment in gymnasium.wrappers.FlattenObservation"
+            )
         self.rollout_buffer_class = SequenceBuffer
         super()._setup_model()
         self.adapter = adapt(self.policy)

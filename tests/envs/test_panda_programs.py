@@ -7,6 +7,9 @@ import pytest
 
 from progpolicy_envs import get_domain
 from tests.handwritten.evaluate import play, play_plan, size_of
+
+pytest.importorskip("pybullet")
+
 from tests.handwritten.panda import PROGRAMS
 
 
