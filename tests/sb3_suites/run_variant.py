@@ -68,7 +68,8 @@ def main() -> None:
     setattr(importlib.import_module(variant.package), variant.replaced, variant.by)
     plugin = Substitution(variant)
     modules = [str(path) for path in sorted(Path(suite).glob("test_*.py")) if variant.replaced in path.read_text()]
-    pytest.main(["-q", "--tb=short", "-p", "no:cacheprovider", *modules], plugins=[plugin])
+    options = ["-q", "--tb=short", "-p", "no:cacheprovider", "-m", "not slow and not expensive"]
+    pytest.main([*options, *modules], plugins=[plugin])
     Path(results).write_text(json.dumps(plugin.results))
 
 

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import sb3_contrib
 import stable_baselines3
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.policies import BasePolicy
 
 from sb3_progpolicy import ProgrammaticPolicy, RecurrentProgrammaticPolicy, ReptilePPO
 
@@ -33,12 +33,12 @@ class OneEnvironment(ReptilePPO):
 
 class ReptileMlp(OneEnvironment):
     defaults = {"interaction_history": False}
-    policy_aliases = aliases(ActorCriticPolicy)
+    policy_aliases = stable_baselines3.PPO.policy_aliases
 
 
 class ReptileMlpLstm(OneEnvironment):
     defaults = {"interaction_history": False}
-    policy_aliases = aliases(ReptilePPO.policy_aliases["MlpLstmPolicy"])
+    policy_aliases = sb3_contrib.RecurrentPPO.policy_aliases
 
 
 class ReptileProg(OneEnvironment):
