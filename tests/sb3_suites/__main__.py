@@ -72,7 +72,8 @@ def main() -> int:
             print(line, flush=True)
             lines.append(line)
             unexplained += failures
-    print(*unexplained, sep="\n")
+    if unexplained:
+        print("", *unexplained, sep="\n")
     if options.output is not None:
         options.output.write_text("\n".join(lines) + "\n")
     return int(bool(unexplained))
