@@ -1,0 +1,1 @@
+HIRO = None
