@@ -46,7 +46,8 @@ def check_update(loss: th.Tensor, timesteps: int, advice: str = _ADVICE) -> None
     """
     if not bool(th.isfinite(loss)):
         raise FloatingPointError(
-            f"the loss is not finite (NaN or infinite) in the update at step {timesteps}; training has stopped. {advice}"
+            f"the loss is not finite (NaN or infinite) in the update at step {timesteps}; training has stopped. "
+            f"{advice}"
         )
 
 

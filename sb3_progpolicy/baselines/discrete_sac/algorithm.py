@@ -58,10 +58,10 @@ def fraction_after(prefix: str, name: str, value: str | float, default: float) -
 class DiscreteSAC(OffPolicyAlgorithm):
     """Soft actor-critic for discrete actions (SAC-Discrete).
 
-    Source: Christodoulou 2019, arXiv:1910.07207. The actor is categorical and each critic has one Q-value for each action,
-    so all expectations over actions are exact sums, without sampling (equations 10 to 12). Arguments are those of SB3's
-    ``SAC``, in the same order and with the same defaults; those about noise on actions have no meaning here and are
-    left out.
+    Source: Christodoulou 2019, arXiv:1910.07207. The actor is categorical and each critic has one Q-value for each
+    action, so all expectations over actions are exact sums, without sampling (equations 10 to 12). Arguments are those
+    of SB3's ``SAC``, in the same order and with the same defaults; those about noise on actions have no meaning here
+    and are left out.
 
     :param policy: ``"MlpPolicy"``, ``"CnnPolicy"``, ``"MultiInputPolicy"`` or a class
     :param env: environment, vectorised environment or id, with ``Discrete`` actions
@@ -208,7 +208,7 @@ class DiscreteSAC(OffPolicyAlgorithm):
 
         :param gradient_steps: number of them
         :param batch_size: transitions of each
-        :raises FloatingPointError: if a loss or a parameter is not finite
+        :raises FloatingPointError: if a loss is not finite
         """
         self.policy.set_training_mode(True)
         optimizers = [self.actor.optimizer, self.critic.optimizer]
@@ -230,7 +230,6 @@ class DiscreteSAC(OffPolicyAlgorithm):
             if step % self.target_update_interval == 0:
                 polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
                 polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
-        check_parameters(self.policy.named_parameters(), self.num_timesteps)
         self._n_updates += gradient_steps
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -282,7 +281,9 @@ class DiscreteSAC(OffPolicyAlgorithm):
         :param progress_bar: whether one is shown
         :raises FloatingPointError: at the first number that is not finite
         """
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        check_parameters(self.policy.named_parameters(), self.num_timesteps)
+        return self
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "actor", "critic", "critic_target"]

@@ -122,7 +122,7 @@ class DiscreteSACPolicy(BasePolicy):
     :param observation_space: of the environment
     :param action_space: ``Discrete``
     :param lr_schedule: learning rate as a function of the progress remaining
-    :param net_arch: units of the hidden layers, or ``{"pi": [...], "qf": [...]}``; 256, 256 by default, none behind a CNN
+    :param net_arch: units of the hidden layers, or ``{"pi": [...], "qf": [...]}``; by default 256, 256, none behind a CNN
     :param activation_fn: between layers
     :param features_extractor_class: before the networks
     :param features_extractor_kwargs: its arguments
@@ -236,11 +236,14 @@ class CnnPolicy(DiscreteSACPolicy):
 
     def __init__(
         self,
-        *args: Any,
-        features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Discrete,
+        lr_schedule: Schedule,
         **kwargs: Any,
     ) -> None:
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+        super().__init__(
+            observation_space, action_space, lr_schedule, **{"features_extractor_class": NatureCNN, **kwargs}
+        )
 
 
 class MultiInputPolicy(DiscreteSACPolicy):
@@ -248,8 +251,11 @@ class MultiInputPolicy(DiscreteSACPolicy):
 
     def __init__(
         self,
-        *args: Any,
-        features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Discrete,
+        lr_schedule: Schedule,
         **kwargs: Any,
     ) -> None:
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+        super().__init__(
+            observation_space, action_space, lr_schedule, **{"features_extractor_class": CombinedExtractor, **kwargs}
+        )

@@ -48,7 +48,7 @@ class Losses(NamedTuple):
 
 
 def soft_value(log_probs: th.Tensor, q_values: th.Tensor, ent_coef: th.Tensor) -> th.Tensor:
-    """Return the value of states, ``(batch, 1)``: the mean over actions of ``Q - ent_coef * log_prob`` (equation 10)."""
+    """Return values of states, ``(batch, 1)``: the mean over actions of ``Q - ent_coef * log_prob`` (equation 10)."""
     return (log_probs.exp() * (q_values - ent_coef * log_probs)).sum(dim=1, keepdim=True)
 
 
@@ -71,7 +71,7 @@ def mean_entropy(log_probs: th.Tensor) -> th.Tensor:
 
 
 def gradient_step(policy: DiscreteSACPolicy, batch: Batch, ent_coef: th.Tensor) -> Losses:
-    """Make one step of the critics, then one of the actor.
+    """Make one step of the critics and one of the actor, both from the same Q-values.
 
     :param policy: whose networks and optimizers are used; its target networks are left alone
     :param batch: of transitions
@@ -89,10 +89,8 @@ def gradient_step(policy: DiscreteSACPolicy, batch: Batch, ent_coef: th.Tensor) 
     critic_loss.backward()
     policy.critic.optimizer.step()
 
-    with th.no_grad():
-        lowest_q = th.stack(policy.critic(batch.observations)).amin(dim=0)
     log_probs = policy.actor.log_probs(batch.observations)
-    actor_loss = policy_loss(log_probs, lowest_q, ent_coef)
+    actor_loss = policy_loss(log_probs, th.stack(q_values).detach().amin(dim=0), ent_coef)
     policy.actor.optimizer.zero_grad()
     actor_loss.backward()
     policy.actor.optimizer.step()
