@@ -16,6 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
 
 from sb3_progpolicy.baselines.arguments import check_action_space, check_off_policy, check_range
+from sb3_progpolicy.baselines.batch import Batch
 from sb3_progpolicy.baselines.discrete_sac.policies import (
     CnnPolicy,
     DiscreteActor,
@@ -24,7 +25,7 @@ from sb3_progpolicy.baselines.discrete_sac.policies import (
     MlpPolicy,
     MultiInputPolicy,
 )
-from sb3_progpolicy.baselines.discrete_sac.update import Batch, Losses, ent_coef_loss, gradient_step
+from sb3_progpolicy.baselines.discrete_sac.update import Losses, ent_coef_loss, gradient_step
 from sb3_progpolicy.finite import check_parameters, check_step, check_update
 
 SelfDiscreteSAC = TypeVar("SelfDiscreteSAC", bound="DiscreteSAC")
