@@ -25,7 +25,7 @@ from sb3_progpolicy.baselines.discrete_sac.policies import (
     MlpPolicy,
     MultiInputPolicy,
 )
-from sb3_progpolicy.baselines.discrete_sac.update import Losses, ent_coef_loss, gradient_step
+from sb3_progpolicy.baselines.discrete_sac.update import TARGET_ENTROPY_FRACTION, Losses, ent_coef_loss, gradient_step
 from sb3_progpolicy.finite import check_parameters, check_step, check_update
 
 SelfDiscreteSAC = TypeVar("SelfDiscreteSAC", bound="DiscreteSAC")
@@ -80,9 +80,9 @@ class DiscreteSAC(OffPolicyAlgorithm):
     :param n_steps: of the returns
     :param ent_coef: entropy coefficient (alpha); ``"auto"`` tunes it from 1, ``"auto_0.1"`` from 0.1
     :param target_update_interval: gradient steps between updates of the target critics
-    :param target_entropy: in nats, which the tuned coefficient holds; ``"auto_0.5"`` for half the entropy of the uniform
-        policy, ``log(n_actions)``; ``"auto"`` for the paper's fraction, 0.98. Values well below explore less and win more
-        where a few wrong actions end an episode
+    :param target_entropy: in nats, which the tuned coefficient holds; ``"auto_0.98"`` for the paper's fraction of
+        ``log(n_actions)``, the entropy of the uniform policy; ``"auto"`` for half of it. The paper's keeps the policy
+        all but uniform; where that ends episodes, as on CartPole, the coefficient grows without bound
     :param stats_window_size: episodes in the logged means
     :param tensorboard_log: folder of the log
     :param policy_kwargs: arguments of the policy
@@ -173,7 +173,7 @@ class DiscreteSAC(OffPolicyAlgorithm):
     def _check_target_entropy(self) -> float:
         """Return the target entropy in nats."""
         uniform = math.log(self.action_space.n)
-        fraction = fraction_after("auto", "target_entropy", self.target_entropy, 0.98)
+        fraction = fraction_after("auto", "target_entropy", self.target_entropy, TARGET_ENTROPY_FRACTION)
         target = float(self.target_entropy) if fraction is None else fraction * uniform
         check_range("target_entropy", target, 0, max(uniform, 1e-12))
         return target

@@ -122,7 +122,8 @@ class DiscreteSACPolicy(BasePolicy):
     :param observation_space: of the environment
     :param action_space: ``Discrete``
     :param lr_schedule: learning rate as a function of the progress remaining
-    :param net_arch: units of the hidden layers, or ``{"pi": [...], "qf": [...]}``; by default 256, 256, none behind a CNN
+    :param net_arch: units of the hidden layers, or ``{"pi": [...], "qf": [...]}``; by default 256, 256, none behind a
+        CNN
     :param activation_fn: between layers
     :param features_extractor_class: before the networks
     :param features_extractor_kwargs: its arguments

@@ -15,6 +15,9 @@ from sb3_progpolicy.baselines.batch import Batch
 from sb3_progpolicy.baselines.discrete_sac.policies import DiscreteSACPolicy
 
 
+TARGET_ENTROPY_FRACTION = 0.5  # of log(n_actions), unless another is given
+
+
 class Losses(NamedTuple):
     """What one gradient step was made with; scalars without gradient.
 

@@ -35,30 +35,33 @@ class HIRO(OffPolicyAlgorithm):
 
     Source: Nachum et al. 2018, "Data-Efficient Hierarchical Reinforcement Learning", arXiv:1805.08296. Every
     ``goal_period`` steps the high level proposes a goal, a wished change of some numbers of the observation; in between
-    it follows the goal transition ``h(s, g, s') = s + g - s'``. The low level is paid ``-||s + g - s'||`` and nothing else, the
-    high level the environment's rewards, summed. Both are TD3. When the high level learns from old segments, their goals
-    are replaced by those under which the low level, as it is now, would act as it did then (off-policy correction).
+    it follows the goal transition ``h(s, g, s') = s + g - s'``. The low level is paid ``-||s + g - s'||`` and nothing
+    else, the high level the environment's rewards, summed. Both are TD3. When the high level learns from old segments,
+    their goals are replaced by those under which the low level, as it is now, would act as it did then (off-policy
+    correction).
 
-    Where this differs from the paper: goals and distances are counted in units of ``goal_scale``, so that numbers of different
-    kinds count alike; the low level's values take a goal to hold on, beyond its period and the episode's end; goals stay
-    random until the low level has learnt for a while (``high_learning_starts``). With ``Discrete`` actions the low level is
-    discrete soft actor-critic, whose probabilities are what the correction asks for; its exploration is its entropy.
+    Where this differs from the paper: goals and distances are counted in units of ``goal_scale``, so that numbers of
+    different kinds count alike; the low level's values take a goal to hold on, beyond its period and the episode's end;
+    goals stay random until the low level has learnt for a while (``high_learning_starts``). With ``Discrete`` actions
+    the low level is discrete soft actor-critic, whose probabilities are what the correction asks for; its exploration
+    is its entropy.
 
     Arguments are those of SB3's ``TD3``, in the same order, less the choice of a replay buffer, and more about goals.
 
     :param policy: ``"MlpPolicy"`` or a class
-    :param env: environment, vectorised environment or id, with observations that are vectors and ``Box`` or ``Discrete``
-        actions
+    :param env: environment, vectorised environment or id, with observations that are vectors and ``Box`` or
+        ``Discrete`` actions
     :param learning_rate: of all networks; a number or a function of the progress remaining
     :param buffer_size: steps kept
     :param learning_starts: environment steps with uniformly drawn actions before learning begins; the scale of goals is
         measured on them
     :param batch_size: steps of a gradient step of the low level, and segments of one of the high level
     :param tau: weight of the networks in each update of their targets, 0 to 1
-    :param gamma: discount of each level's own steps, 0 to 1: of a segment for the high level, of a step for the low level
+    :param gamma: discount of each level's own steps, 0 to 1: of a segment for the high level, of a step for the low
+        level
     :param train_freq: steps, or ``(n, "step")`` or ``(n, "episode")``, between updates
-    :param gradient_steps: gradient steps of the low level in an update, -1 for as many as steps were made since the last;
-        the high level makes one for every ``goal_period`` of them
+    :param gradient_steps: gradient steps of the low level in an update, -1 for as many as steps were made since the
+        last; the high level makes one for every ``goal_period`` of them
     :param action_noise: on the low level's actions, in -1 to 1; Gaussian of standard deviation 0.1 by default, and not
         accepted with ``Discrete`` actions
     :param policy_delay: critic updates for each update of an actor and the targets
@@ -66,11 +69,12 @@ class HIRO(OffPolicyAlgorithm):
     :param target_noise_clip: bound of that noise
     :param goal_period: steps under one goal, the paper's c
     :param goal_dims: indices of the observation that goals address; all by default
-    :param goal_scale: largest goal along each of them, in the observation's units, one number or one for each; ``"auto"`` for
-        the largest change seen over ``goal_period`` of the first steps. Along what has not changed there are no goals
+    :param goal_scale: largest goal along each of them, in the observation's units, one number or one for each;
+        ``"auto"`` for the largest change seen over ``goal_period`` of the first steps. Along what has not changed there
+        are no goals
     :param goal_noise: standard deviation of the noise on goals, in units of ``goal_scale``
-    :param high_learning_starts: environment steps with uniformly drawn goals, in which the low level learns to reach them;
-        ``learning_starts`` at least
+    :param high_learning_starts: environment steps with uniformly drawn goals, in which the low level learns to reach
+        them; ``learning_starts`` at least
     :param reward_scale: factor on the rewards that the high level sums; 0.1 in the paper
     :param stats_window_size: episodes in the logged means
     :param tensorboard_log: folder of the log
@@ -152,7 +156,8 @@ class HIRO(OffPolicyAlgorithm):
         )
         self.goal_period, self.goal_dims, self.goal_scale = goal_period, goal_dims, goal_scale
         self.goal_noise, self.high_learning_starts, self.reward_scale = goal_noise, high_learning_starts, reward_scale
-        self.td3_settings = td3.TD3Settings(tau, policy_delay, target_policy_noise, target_noise_clip)
+        self.policy_delay, self.target_policy_noise = policy_delay, target_policy_noise
+        self.target_noise_clip = target_noise_clip
         self.ent_coef: EntropyCoefficient | None = None
         self._goal_state: GoalState | None = None
         self._scale_is_known = False
@@ -193,8 +198,8 @@ class HIRO(OffPolicyAlgorithm):
         dims = list(range(size)) if self.goal_dims is None else [int(dim) for dim in self.goal_dims]
         if not dims or len(set(dims)) < len(dims) or not all(0 <= dim < size for dim in dims):
             raise ValueError(
-                f"goal_dims={self.goal_dims!r} is not accepted; it has one or more different indices of the observation, "
-                f"from 0 to {size - 1}"
+                f"goal_dims={self.goal_dims!r} is not accepted; it has one or more different indices of the "
+                f"observation, from 0 to {size - 1}"
             )
         return dims
 
@@ -289,6 +294,10 @@ class HIRO(OffPolicyAlgorithm):
         for key, values in logs.items():
             self.logger.record(f"train/{key}", safe_mean(values))
 
+    @property
+    def _td3_settings(self) -> td3.TD3Settings:
+        return td3.TD3Settings(self.tau, self.policy_delay, self.target_policy_noise, self.target_noise_clip)
+
     def _optimizers(self) -> list[th.optim.Optimizer]:
         levels = (self.policy.high, self.policy.low)
         optimizers = [network.optimizer for level in levels for network in (level.actor, level.critic)]
@@ -313,7 +322,7 @@ class HIRO(OffPolicyAlgorithm):
         assert self.replay_buffer is not None
         steps = self.replay_buffer.sample_steps(batch_size, self._vec_normalize_env)
         batch = low_batch(self.policy, steps, self.gamma)
-        losses = low_step(self.policy, batch, self.td3_settings, self._n_updates, self.ent_coef)
+        losses = low_step(self.policy, batch, self._td3_settings, self._n_updates, self.ent_coef)
         logs.setdefault("intrinsic_reward", []).append(batch.rewards.mean().item())
         if self.ent_coef is not None:
             logs.setdefault("ent_coef", []).append(self.ent_coef.value().item())
@@ -328,7 +337,7 @@ class HIRO(OffPolicyAlgorithm):
         relabelled = (batch.actions != segments.goals).any(dim=1).float().mean()
         logs.setdefault("relabelled", []).append(relabelled.item())
         n_updates = self._n_updates // self.goal_period
-        self._note_losses("high", td3.gradient_step(self.policy.high, batch, self.td3_settings, n_updates), logs)
+        self._note_losses("high", td3.gradient_step(self.policy.high, batch, self._td3_settings, n_updates), logs)
 
     def _note_losses(
         self, level: str, losses: tuple[th.Tensor, th.Tensor | None], logs: dict[str, list[float]]

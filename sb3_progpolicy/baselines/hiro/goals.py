@@ -1,9 +1,9 @@
 """Goals and what follows from them: one function per definition of the paper.
 
 Source: Nachum et al. 2018, "Data-Efficient Hierarchical Reinforcement Learning", arXiv:1805.08296. A goal is a wished
-change of some numbers of the observation, called the position here, in their units. ``scale`` is the largest goal along each
-dimension, 0 along one without goals: networks see goals divided by it, so in -1 to 1.
-Shapes: positions and goals ``(..., n_goal_dims)``, ``scale`` ``(n_goal_dims,)``.
+change of some numbers of the observation, called the position here, in their units. ``scale`` is the largest goal along
+each dimension, 0 along one without goals: networks see goals divided by it, so in -1 to 1. Shapes: positions and goals
+``(..., n_goal_dims)``, ``scale`` ``(n_goal_dims,)``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ CANDIDATE_STD = 0.5  # of the scale; appendix C of the paper
 
 
 def goal_transition(position: th.Tensor, goal: th.Tensor, next_position: th.Tensor) -> th.Tensor:
-    """Return the goal that points to the same place from the next position: ``h(s, g, s') = s + g - s'`` (section 3.1)."""
+    """Return the goal that points to the same place from the next position, ``h(s, g, s') = s + g - s'``."""
     return position + goal - next_position
 
 
@@ -33,7 +33,7 @@ def intrinsic_reward(position: th.Tensor, goal: th.Tensor, next_position: th.Ten
 
 
 def candidate_goals(goals: th.Tensor, start: th.Tensor, end: th.Tensor, scale: th.Tensor) -> th.Tensor:
-    """Return the goals among which relabelling chooses (section 3.3), ``(batch, 10, n_goal_dims)``, in units of the scale.
+    """Return the goals among which relabelling chooses, ``(batch, 10, n_goal_dims)``, in units of the scale.
 
     They are the original, what was reached, and eight from a Gaussian around that, all within -1 to 1.
 

@@ -15,8 +15,6 @@ from sb3_progpolicy.baselines.hiro.buffer import Segments, Steps
 from sb3_progpolicy.baselines.hiro.goals import candidate_goals, intrinsic_reward
 from sb3_progpolicy.baselines.hiro.policies import HIROPolicy
 
-TARGET_ENTROPY_FRACTION = 0.5  # of a discrete low level, of the uniform policy's
-
 
 class EntropyCoefficient(th.nn.Module):
     """The tuned entropy coefficient of a discrete low level.
@@ -27,7 +25,7 @@ class EntropyCoefficient(th.nn.Module):
 
     def __init__(self, n_actions: int, learning_rate: float) -> None:
         super().__init__()
-        self.target_entropy = TARGET_ENTROPY_FRACTION * math.log(n_actions)
+        self.target_entropy = discrete_sac.TARGET_ENTROPY_FRACTION * math.log(n_actions)
         self.log_value = th.nn.Parameter(th.zeros(1))
         self.optimizer = th.optim.Adam(self.parameters(), lr=learning_rate)
 
@@ -49,8 +47,8 @@ class EntropyCoefficient(th.nn.Module):
 def low_batch(policy: HIROPolicy, steps: Steps, gamma: float) -> Batch:
     """Return what the low level learns from.
 
-    A goal is taken to hold on after its period and after the episode: the low level's task is to reach it, so its values
-    do not depend on the high level, and an episode's end is neither won nor lost.
+    A goal is taken to hold on after its period and after the episode: the low level's task is to reach it, so its
+    values do not depend on the high level, and an episode's end is neither won nor lost.
 
     :param policy: which says what goals mean
     :param steps: from the replay buffer

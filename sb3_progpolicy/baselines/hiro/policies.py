@@ -34,16 +34,17 @@ class GoalState(NamedTuple):
 class HIROPolicy(BasePolicy):
     """A high level that proposes goals, and a low level that reads observation and goal and acts.
 
-    The high level is a ``TD3Policy`` of SB3 whose actions are goals in units of the scale. For ``Box`` actions the low level is
-    one too; for ``Discrete`` actions it is a :class:`~sb3_progpolicy.baselines.discrete_sac.DiscreteSACPolicy`.
+    The high level is a ``TD3Policy`` of SB3 whose actions are goals in units of the scale. For ``Box`` actions the low
+    level is one too; for ``Discrete`` actions it is a
+    :class:`~sb3_progpolicy.baselines.discrete_sac.DiscreteSACPolicy`.
 
     :param observation_space: one-dimensional ``Box``
     :param action_space: ``Box`` or ``Discrete``
     :param lr_schedule: learning rate as a function of the progress remaining
     :param goal_dims: indices of the observation that goals address
     :param goal_period: steps under one goal
-    :param net_arch: units of the hidden layers of all networks, or ``{"pi": [...], "qf": [...]}``; 300, 300 by default, as
-        in the paper
+    :param net_arch: units of the hidden layers of all networks, or ``{"pi": [...], "qf": [...]}``; 300, 300 by default,
+        as in the paper
     :param activation_fn: between layers
     :param optimizer_class: of all networks
     :param optimizer_kwargs: its arguments besides the learning rate
