@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 
 SIZE = 10.0
 WALL = (4.0, 6.0)  # along y
-WALL_END = 7.0  # along x; beyond it the corridor goes around
+WALL_END = 6.0  # along x; beyond it the corridor goes around
 TARGET = (1.0, 9.0)
 RADIUS = 1.0
 SPEED = 0.5  # a step
-MAX_STEPS = 100
+MAX_STEPS = 200
 
 
 class PointMazeEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """A square with a wall between start, below left, and target, above left; the way around is 22 long, 40 steps.
+    """A square with a wall between start, below left, and target, above left; the way around takes some 25 steps.
 
     Observation: the position, ``Box(-1, 1, (2,))``, the square's middle being 0. Action: the velocity, likewise.
-    Reward: -1 a step until the target is reached, which ends the episode; after 100 steps it is truncated.
+    Reward: -1 a step until the target is reached, which ends the episode; after 200 steps it is truncated.
     """
 
     observation_space = spaces.Box(-1.0, 1.0, (2,), np.float32)

@@ -54,8 +54,15 @@ class DiscreteActor(BasePolicy):
         return th.log_softmax(self.logits(self.extract_features(obs, self.features_extractor)), dim=1)
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        """Return actions, ``(batch,)``: drawn, or the most likely ones."""
+        """Return actions, ``(batch,)``: drawn, or the most likely ones.
+
+        :raises FloatingPointError: if an observation or a parameter is not finite
+        """
         log_probs = self.log_probs(obs)
+        if not bool(th.isfinite(log_probs).all()):
+            raise FloatingPointError(
+                "the probabilities of actions are not finite; an observation or a parameter is not"
+            )
         chosen = log_probs.argmax(dim=1) if deterministic else th.multinomial(log_probs.exp(), 1).squeeze(1)
         return chosen + int(self.action_space.start)
 

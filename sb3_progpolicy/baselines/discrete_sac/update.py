@@ -14,7 +14,6 @@ from torch.nn import functional as F
 from sb3_progpolicy.baselines.batch import Batch
 from sb3_progpolicy.baselines.discrete_sac.policies import DiscreteSACPolicy
 
-
 TARGET_ENTROPY_FRACTION = 0.5  # of log(n_actions), unless another is given
 
 

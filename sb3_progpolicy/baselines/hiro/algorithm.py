@@ -70,7 +70,7 @@ class HIRO(OffPolicyAlgorithm):
     :param goal_period: steps under one goal, the paper's c
     :param goal_dims: indices of the observation that goals address; all by default
     :param goal_scale: largest goal along each of them, in the observation's units, one number or one for each;
-        ``"auto"`` for the largest change seen over ``goal_period`` of the first steps. Along what has not changed there
+        ``"auto"`` for twice the largest change seen over ``goal_period`` of the first steps. Along what has not changed there
         are no goals
     :param goal_noise: standard deviation of the noise on goals, in units of ``goal_scale``
     :param high_learning_starts: environment steps with uniformly drawn goals, in which the low level learns to reach

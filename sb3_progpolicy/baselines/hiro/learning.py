@@ -15,6 +15,8 @@ from sb3_progpolicy.baselines.hiro.buffer import Segments, Steps
 from sb3_progpolicy.baselines.hiro.goals import candidate_goals, intrinsic_reward
 from sb3_progpolicy.baselines.hiro.policies import HIROPolicy
 
+DIRECTED_REACH = 2.0  # how much farther than the largest change under random actions a goal may lie
+
 
 class EntropyCoefficient(th.nn.Module):
     """The tuned entropy coefficient of a discrete low level.
@@ -136,10 +138,10 @@ def low_step(
 
 
 def measured_scale(policy: HIROPolicy, segments: Segments) -> th.Tensor:
-    """Return for each goal dimension the largest change that was seen over a segment, 0 where there was none.
+    """Return for each goal dimension twice the largest change that was seen over a segment, 0 where there was none.
 
     :param policy: which says what goals address
     :param segments: from the replay buffer
     """
     change = policy.positions(segments.ends) - policy.positions(segments.observations[:, 0])
-    return change.abs().amax(dim=0)
+    return DIRECTED_REACH * change.abs().amax(dim=0)
