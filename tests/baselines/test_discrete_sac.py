@@ -112,7 +112,9 @@ def test_saved_model_predicts_and_learns_on_alike(tmp_path, ent_coef):
         loaded.predict(observations, deterministic=True)[0], model.predict(observations, deterministic=True)[0]
     )
     with th.no_grad():
-        assert th.equal(loaded.critic_target(th.tensor(observations))[1], model.critic_target(th.tensor(observations))[1])
+        assert th.equal(
+            loaded.critic_target(th.tensor(observations))[1], model.critic_target(th.tensor(observations))[1]
+        )
     if ent_coef == 0.2:
         assert loaded.ent_coef_tensor.item() == pytest.approx(0.2)
     else:

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -70,8 +70,8 @@ class HIRO(OffPolicyAlgorithm):
     :param goal_period: steps under one goal, the paper's c
     :param goal_dims: indices of the observation that goals address; all by default
     :param goal_scale: largest goal along each of them, in the observation's units, one number or one for each;
-        ``"auto"`` for twice the largest change seen over ``goal_period`` of the first steps. Along what has not changed there
-        are no goals
+        ``"auto"`` for twice the largest change seen over ``goal_period`` of the first steps. Along what has not changed
+        there are no goals
     :param goal_noise: standard deviation of the noise on goals, in units of ``goal_scale``
     :param high_learning_starts: environment steps with uniformly drawn goals, in which the low level learns to reach
         them; ``learning_starts`` at least
@@ -225,6 +225,9 @@ class HIRO(OffPolicyAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
+        noise = self.action_noise
+        if isinstance(noise, VectorizedActionNoise) and noise.n_envs != self.n_envs:
+            self.action_noise = noise.base_noise  # a model that was loaded for another number of environments
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         assert self._last_episode_starts is not None
         if self._last_episode_starts.all():
