@@ -41,10 +41,10 @@ class HIRO(OffPolicyAlgorithm):
     correction).
 
     Where this differs from the paper: goals and distances are counted in units of ``goal_scale``, so that numbers of
-    different kinds count alike; the low level's values take a goal to hold on, beyond its period and the episode's end;
-    goals stay random until the low level has learnt for a while (``high_learning_starts``). With ``Discrete`` actions
-    the low level is discrete soft actor-critic, whose probabilities are what the correction asks for; its exploration
-    is its entropy.
+    different kinds count alike; the low level's values take a goal to hold on, beyond its period and the episode's end,
+    and look less far (``low_gamma``); goals stay random until the low level has learnt for a while
+    (``high_learning_starts``). With ``Discrete`` actions the low level is discrete soft actor-critic, whose
+    probabilities are what the correction asks for; its exploration is its entropy.
 
     Arguments are those of SB3's ``TD3``, in the same order, less the choice of a replay buffer, and more about goals.
 
@@ -57,8 +57,7 @@ class HIRO(OffPolicyAlgorithm):
         measured on them
     :param batch_size: steps of a gradient step of the low level, and segments of one of the high level
     :param tau: weight of the networks in each update of their targets, 0 to 1
-    :param gamma: discount of each level's own steps, 0 to 1: of a segment for the high level, of a step for the low
-        level
+    :param gamma: discount of the high level's steps, which are segments, 0 to 1
     :param train_freq: steps, or ``(n, "step")`` or ``(n, "episode")``, between updates
     :param gradient_steps: gradient steps of the low level in an update, -1 for as many as steps were made since the
         last; the high level makes one for every ``goal_period`` of them
@@ -76,6 +75,7 @@ class HIRO(OffPolicyAlgorithm):
     :param high_learning_starts: environment steps with uniformly drawn goals, in which the low level learns to reach
         them; ``learning_starts`` at least
     :param reward_scale: factor on the rewards that the high level sums; 0.1 in the paper
+    :param low_gamma: discount of the low level's steps, 0 to 1
     :param stats_window_size: episodes in the logged means
     :param tensorboard_log: folder of the log
     :param policy_kwargs: arguments of the policy
@@ -113,6 +113,7 @@ class HIRO(OffPolicyAlgorithm):
         goal_noise: float = 0.1,
         high_learning_starts: int = 5_000,
         reward_scale: float = 0.1,
+        low_gamma: float = 0.95,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -122,15 +123,11 @@ class HIRO(OffPolicyAlgorithm):
         _init_setup_model: bool = True,
     ) -> None:
         check_off_policy(locals())
-        for name, value in {"policy_delay": policy_delay, "goal_period": goal_period}.items():
-            check_range(name, value, 1)
-        for name, value in {
-            "target_policy_noise": target_policy_noise,
-            "target_noise_clip": target_noise_clip,
-            "goal_noise": goal_noise,
-            "high_learning_starts": high_learning_starts,
-        }.items():
-            check_range(name, value, 0)
+        for name in ("policy_delay", "goal_period"):
+            check_range(name, locals()[name], 1)
+        for name in ("target_policy_noise", "target_noise_clip", "goal_noise", "high_learning_starts"):
+            check_range(name, locals()[name], 0)
+        check_range("low_gamma", low_gamma, 0, 1)
         check_range("reward_scale", reward_scale, 0, open_low=True)
         super().__init__(
             policy,
@@ -156,6 +153,7 @@ class HIRO(OffPolicyAlgorithm):
         )
         self.goal_period, self.goal_dims, self.goal_scale = goal_period, goal_dims, goal_scale
         self.goal_noise, self.high_learning_starts, self.reward_scale = goal_noise, high_learning_starts, reward_scale
+        self.low_gamma = low_gamma
         self.policy_delay, self.target_policy_noise = policy_delay, target_policy_noise
         self.target_noise_clip = target_noise_clip
         self.ent_coef: EntropyCoefficient | None = None
@@ -207,11 +205,12 @@ class HIRO(OffPolicyAlgorithm):
         """Return the scale given, ``(n_dims,)``, or ``None`` for ``"auto"``."""
         if isinstance(self.goal_scale, str) and self.goal_scale == "auto":
             return None
+        scale: NDArray[Any]
         try:
             scale = np.broadcast_to(np.asarray(self.goal_scale, dtype=np.float32), (n_dims,))
         except ValueError:
-            scale = np.zeros(0)
-        if not scale.size or not (np.isfinite(scale) & (scale > 0)).all():
+            scale = np.zeros(1)
+        if not (np.isfinite(scale) & (scale > 0)).all():
             raise ValueError(
                 f"goal_scale={self.goal_scale!r} is not accepted; it is 'auto', a number above 0, or {n_dims} of them"
             )
@@ -324,7 +323,7 @@ class HIRO(OffPolicyAlgorithm):
     def _train_low(self, batch_size: int, logs: dict[str, list[float]]) -> None:
         assert self.replay_buffer is not None
         steps = self.replay_buffer.sample_steps(batch_size, self._vec_normalize_env)
-        batch = low_batch(self.policy, steps, self.gamma)
+        batch = low_batch(self.policy, steps, self.low_gamma)
         losses = low_step(self.policy, batch, self._td3_settings, self._n_updates, self.ent_coef)
         logs.setdefault("intrinsic_reward", []).append(batch.rewards.mean().item())
         if self.ent_coef is not None:

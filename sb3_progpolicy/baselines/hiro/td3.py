@@ -59,7 +59,9 @@ def gradient_step(
     if n_updates % settings.policy_delay:
         return critic_loss.detach(), None
 
-    actor_loss = -policy.critic.q1_forward(batch.observations, policy.actor(batch.observations)).mean()
+    observations = batch.observations
+    assert isinstance(observations, th.Tensor)
+    actor_loss = -policy.critic.q1_forward(observations, policy.actor(observations)).mean()
     policy.actor.optimizer.zero_grad()
     actor_loss.backward()
     policy.actor.optimizer.step()
