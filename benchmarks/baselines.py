@@ -53,17 +53,15 @@ CARTPOLE_SAC: dict[str, Any] = {
     "gradient_steps": 4,
     "policy_kwargs": SMALL,
 }
-MAZE: dict[str, Any] = {"gradient_steps": 4, "batch_size": 128, "policy_kwargs": SMALL}
-RANDOM_STEPS = 12_000
-MAZE_HIRO: dict[str, Any] = {**MAZE, "high_learning_starts": RANDOM_STEPS}
+MAZE: dict[str, Any] = {"gradient_steps": 4, "batch_size": 128, "tau": 0.02, "policy_kwargs": SMALL}
+RANDOM_STEPS = 10_000
+HIRO_SETTINGS: dict[str, Any] = {**MAZE, "low_gamma": 0.9, "high_gradient_steps": 4, "reward_scale": 1.0}
+MAZE_HIRO: dict[str, Any] = {**HIRO_SETTINGS, "high_learning_starts": RANDOM_STEPS}
 REACH: dict[str, Any] = {
-    "gradient_steps": 4,
-    "batch_size": 128,
+    **HIRO_SETTINGS,
     "goal_dims": [26, 27, 28],  # where the hand is
     "learning_starts": 2_000,
     "high_learning_starts": 6_000,
-    "reward_scale": 1.0,
-    "policy_kwargs": SMALL,
 }
 
 Make = Callable[[int], VecEnv]

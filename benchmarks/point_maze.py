@@ -22,7 +22,7 @@ class PointMazeEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """A square with a wall between start, below left, and target, above left; the way around takes some 25 steps.
 
     Observation: the position, ``Box(-1, 1, (2,))``, the square's middle being 0. Action: the velocity, likewise.
-    Reward: -1 a step until the target is reached, which ends the episode; after 200 steps it is truncated.
+    Reward: 1 on reaching the target, which ends the episode, and 0 before; after 200 steps it is truncated.
     """
 
     observation_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -48,7 +48,7 @@ class PointMazeEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.steps += 1
         reached = bool(np.hypot(self.x - TARGET[0], self.y - TARGET[1]) < RADIUS)
         truncated = self.steps >= MAX_STEPS and not reached
-        return self._observation(), -1.0, reached, truncated, {"is_success": reached}
+        return self._observation(), float(reached), reached, truncated, {"is_success": reached}
 
     def _observation(self) -> NDArray[np.float32]:
         return np.array([self.x, self.y], dtype=np.float32) * (2 / SIZE) - 1

@@ -60,7 +60,7 @@ class HIRO(OffPolicyAlgorithm):
     :param gamma: discount of the high level's steps, which are segments, 0 to 1
     :param train_freq: steps, or ``(n, "step")`` or ``(n, "episode")``, between updates
     :param gradient_steps: gradient steps of the low level in an update, -1 for as many as steps were made since the
-        last; the high level makes one for every ``goal_period`` of them
+        last
     :param action_noise: on the low level's actions, in -1 to 1; Gaussian of standard deviation 0.1 by default, and not
         accepted with ``Discrete`` actions
     :param policy_delay: critic updates for each update of an actor and the targets
@@ -76,6 +76,8 @@ class HIRO(OffPolicyAlgorithm):
         them; ``learning_starts`` at least
     :param reward_scale: factor on the rewards that the high level sums; 0.1 in the paper
     :param low_gamma: discount of the low level's steps, 0 to 1
+    :param high_gradient_steps: gradient steps of the high level for every ``goal_period`` of the low level; 1 in the
+        paper, whose budgets are of millions of steps
     :param stats_window_size: episodes in the logged means
     :param tensorboard_log: folder of the log
     :param policy_kwargs: arguments of the policy
@@ -114,6 +116,7 @@ class HIRO(OffPolicyAlgorithm):
         high_learning_starts: int = 5_000,
         reward_scale: float = 0.1,
         low_gamma: float = 0.95,
+        high_gradient_steps: int = 1,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -123,7 +126,7 @@ class HIRO(OffPolicyAlgorithm):
         _init_setup_model: bool = True,
     ) -> None:
         check_off_policy(locals())
-        for name in ("policy_delay", "goal_period"):
+        for name in ("policy_delay", "goal_period", "high_gradient_steps"):
             check_range(name, locals()[name], 1)
         for name in ("target_policy_noise", "target_noise_clip", "goal_noise", "high_learning_starts"):
             check_range(name, locals()[name], 0)
@@ -153,7 +156,8 @@ class HIRO(OffPolicyAlgorithm):
         )
         self.goal_period, self.goal_dims, self.goal_scale = goal_period, goal_dims, goal_scale
         self.goal_noise, self.high_learning_starts, self.reward_scale = goal_noise, high_learning_starts, reward_scale
-        self.low_gamma = low_gamma
+        self.low_gamma, self.high_gradient_steps = low_gamma, high_gradient_steps
+        self._n_high_updates = 0
         self.policy_delay, self.target_policy_noise = policy_delay, target_policy_noise
         self.target_noise_clip = target_noise_clip
         self.ent_coef: EntropyCoefficient | None = None
@@ -276,7 +280,7 @@ class HIRO(OffPolicyAlgorithm):
         self._last_episode_starts = np.asarray(dones, dtype=bool)
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
-        """Make gradient steps of the low level, and one of the high level for every ``goal_period`` of them.
+        """Make gradient steps of the low level, and for every ``goal_period`` of them those of the high level.
 
         :param gradient_steps: of the low level
         :param batch_size: steps, or segments, of each
@@ -290,7 +294,7 @@ class HIRO(OffPolicyAlgorithm):
         for _ in range(gradient_steps):
             self._n_updates += 1
             self._train_low(batch_size, logs)
-            if self._n_updates % self.goal_period == 0:
+            for _ in range(0 if self._n_updates % self.goal_period else self.high_gradient_steps):
                 self._train_high(batch_size, logs)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for key, values in logs.items():
@@ -338,8 +342,9 @@ class HIRO(OffPolicyAlgorithm):
         batch = high_batch(self.policy, segments, self.gamma, self.reward_scale)
         relabelled = (batch.actions != segments.goals).any(dim=1).float().mean()
         logs.setdefault("relabelled", []).append(relabelled.item())
-        n_updates = self._n_updates // self.goal_period
-        self._note_losses("high", td3.gradient_step(self.policy.high, batch, self._td3_settings, n_updates), logs)
+        self._n_high_updates += 1
+        losses = td3.gradient_step(self.policy.high, batch, self._td3_settings, self._n_high_updates)
+        self._note_losses("high", losses, logs)
 
     def _note_losses(
         self, level: str, losses: tuple[th.Tensor, th.Tensor | None], logs: dict[str, list[float]]
