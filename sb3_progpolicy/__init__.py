@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import progpolicy_envs  # registers the environments
 
 if TYPE_CHECKING:
+    from sb3_progpolicy.baselines import HIRO, DiscreteSAC
     from sb3_progpolicy.evaluation import Evaluation, evaluate_model, evaluate_program
     from sb3_progpolicy.extraction import extract_program, holds_program
     from sb3_progpolicy.interaction import InteractionHistory, VecInteractionHistory
@@ -19,7 +20,9 @@ if TYPE_CHECKING:
 
 # Modules are imported when a name is first used: reading and running a program needs no torch.
 _MODULES = {
+    "HIRO": "baselines",
     "BatchedVecEnv": "vec_env",
+    "DiscreteSAC": "baselines",
     "Evaluation": "evaluation",
     "GroupedSubprocVecEnv": "vec_env",
     "GroupedVecEnv": "vec_env",
@@ -43,7 +46,9 @@ _MODULES = {
 }
 
 __all__ = [
+    "HIRO",
     "BatchedVecEnv",
+    "DiscreteSAC",
     "Evaluation",
     "GroupedSubprocVecEnv",
     "GroupedVecEnv",

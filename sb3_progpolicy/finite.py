@@ -33,17 +33,21 @@ def check_step(what: str, values: Any, timesteps: int) -> None:
     )
 
 
-def check_update(loss: th.Tensor, timesteps: int) -> None:
+_ADVICE = "A smaller learning_rate, normalize_observations or scale_rewards may help"
+
+
+def check_update(loss: th.Tensor, timesteps: int, advice: str = _ADVICE) -> None:
     """Raise an error if a loss is not finite.
 
     :param loss: of a minibatch
     :param timesteps: environment steps made so far
+    :param advice: last sentence of the message, what may help
     :raises FloatingPointError: for NaN or infinity
     """
     if not bool(th.isfinite(loss)):
         raise FloatingPointError(
             f"the loss is not finite (NaN or infinite) in the update at step {timesteps}; training has stopped. "
-            "A smaller learning_rate, normalize_observations or scale_rewards may help"
+            f"{advice}"
         )
 
 

@@ -1,0 +1,27 @@
+"""What a gradient step is made from."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch as th
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+
+class Batch(NamedTuple):
+    """Transitions of one gradient step.
+
+    :param observations: ``(batch, ...)``
+    :param actions: ``(batch, action_dim)`` in -1 to 1, or ``(batch, 1)`` whole numbers from 0 to ``n_actions - 1``
+    :param rewards: ``(batch, 1)``
+    :param next_observations: ``(batch, ...)``
+    :param dones: ``(batch, 1)``; 1 where the episode ended by itself, 0 elsewhere and where its time was up
+    :param discounts: of the value of the next observation, ``(batch, 1)`` or a number
+    """
+
+    observations: PyTorchObs
+    actions: th.Tensor
+    rewards: th.Tensor
+    next_observations: PyTorchObs
+    dones: th.Tensor
+    discounts: th.Tensor | float
