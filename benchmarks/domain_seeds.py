@@ -31,7 +31,7 @@ def run_seed(env_id: str, seed: int, folder: Path, overrides: dict[str, Any], ep
     program = train(env_id, seed, folder, overrides)
     domain = DOMAINS[env_id]
     rows = []
-    for kind, variations in (("train", domain.train), ("unseen", domain.unseen)):
+    for kind, variations in (("train", domain.train), ("validation", domain.validation), ("unseen", domain.unseen)):
         results = evaluate_program(program, env_id, variations, episodes, seed=EVALUATION_SEED)
         rows += [
             {

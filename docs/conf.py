@@ -44,7 +44,12 @@ def environment_page(env_id: str) -> str:
     if picture.exists():
         lines += [f"![A state of {env_id}](../images/{picture.name})", ""]
     lines += [inspect.getdoc(creator) or "", "", "## Variations", ""]
-    for words, variations in (("Training", domain.train), ("Unseen in training, to test on", domain.unseen)):
+    sets = {
+        "Training": domain.train,
+        "Validation, to choose hyperparameters by": domain.validation,
+        "Unseen, to test on": domain.unseen,
+    }
+    for words, variations in sets.items():
         lines += [f"{words}:", "", *(f"* `{variation}`" for variation in variations), ""]
     return "\n".join(lines + (controller_figures(env_id) if domain.simulation else planner_figures(env_id)))
 
@@ -61,7 +66,8 @@ def planner_figures(env_id: str) -> list[str]:
         "|---|---|---|---|",
     ]
     env = gym.make(env_id)
-    for variation in (*DOMAINS[env_id].train, *DOMAINS[env_id].unseen):
+    domain = DOMAINS[env_id]
+    for variation in (*domain.train, *domain.validation, *domain.unseen):
         steps = [env.reset(seed=seed, options=dict(variation))[1]["optimal_steps"] for seed in range(N_PLANNED)]
         name = ", ".join(f"{key} = {value}" for key, value in variation.items())
         lines.append(f"| {name} | {np.mean(steps):.1f} | {min(steps)} | {max(steps)} |")

@@ -153,10 +153,10 @@ def test_the_table_of_environments_lists_every_domain_with_ranges_and_both_sets(
     rows = {domain: [line for line in out.split("├") if domain in line] for domain in DOMAINS}
     for domain in DOMAINS.values():
         (row,) = rows[domain.id]
-        for part in (domain.train, domain.unseen):
+        for part in (domain.train, domain.validation, domain.unseen):
             sizes = ", ".join(dict.fromkeys(str(variation[domain.size]) for variation in part))
             assert f"{domain.size}: {sizes}" in row
-        assert row.count(f"{domain.size}: ") == 3, "the range, what is trained on, what is unseen"
+        assert row.count(f"{domain.size}: ") == 4, "the range, what is trained on, what is chosen by, what is unseen"
 
 
 def test_the_table_of_environments_says_what_the_panda_tasks_need_where_pybullet_is_missing():

@@ -8,7 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from progpolicy_envs.domains import DOMAINS, Domain, get_domain
+from progpolicy_envs.domains import DOMAINS, Domain, get_domain, register_domain
 
 MAX_EPISODE_STEPS = 500
 
@@ -16,11 +16,11 @@ MAX_EPISODE_STEPS = 500
 def register_envs() -> None:
     """Register every id that is not registered yet; nothing heavy is imported."""
     for domain in DOMAINS.values():
-        if domain.id not in gym.registry:
+        if domain.entry_point and domain.id not in gym.registry:
             gym.register(
                 id=domain.id,
                 entry_point=domain.entry_point,
-                vector_entry_point=domain.vector_entry_point,
+                vector_entry_point=domain.vector_entry_point or None,
                 max_episode_steps=MAX_EPISODE_STEPS,
                 kwargs=dict(domain.arguments),
             )
@@ -37,4 +37,4 @@ def __getattr__(name: str) -> Any:
 
 register_envs()
 
-__all__ = ["DOMAINS", "Domain", "get_domain", "register_envs"]
+__all__ = ["DOMAINS", "Domain", "get_domain", "register_domain", "register_envs"]

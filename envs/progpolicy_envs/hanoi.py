@@ -40,9 +40,9 @@ def _check_variation(variation: Variation) -> None:
 
 
 VARIATIONS = VariationSpace(
-    IntParameter("n_discs", 1, MAX_DISCS, "number of discs"),
-    IntParameter("source", 0, N_PEGS - 1, "peg on which all discs start", (RANDOM,)),
-    IntParameter("target", 0, N_PEGS - 1, "peg to which all discs go; not the source", (RANDOM,)),
+    IntParameter("n_discs", 1, MAX_DISCS, 3, "number of discs"),
+    IntParameter("source", 0, N_PEGS - 1, 0, "peg on which all discs start", (RANDOM,)),
+    IntParameter("target", 0, N_PEGS - 1, 2, "peg to which all discs go; not the source", (RANDOM,)),
     check=_check_variation,
     starts={"discs": "the peg of each disc, the smallest first"},
 )

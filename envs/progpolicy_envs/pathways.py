@@ -88,8 +88,8 @@ def _check_variation(variation: Variation) -> None:
 
 
 VARIATIONS = VariationSpace(
-    IntParameter("n_stars", 1, MAX_STARS, "number of stars"),
-    LayoutParameter("layout", (*LAYOUTS, RANDOM), "the map; 'random' draws another one for every episode"),
+    IntParameter("n_stars", 1, MAX_STARS, 3, "number of stars"),
+    LayoutParameter("layout", (*LAYOUTS, RANDOM), "valley", "the map; 'random' draws another one for every episode"),
     check=_check_variation,
     starts={
         "hiker": "row and column of the hiker",

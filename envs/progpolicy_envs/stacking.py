@@ -22,7 +22,7 @@ N_SIDE = 5
 N_CELLS = N_SIDE**2
 PICK = planner.PICK
 VARIATIONS = VariationSpace(
-    IntParameter("n_plates", 1, MAX_PLATES, "number of plates"),
+    IntParameter("n_plates", 1, MAX_PLATES, 3, "number of plates"),
     starts={
         "plates": "row and column of each plate on the table, the largest first",
         "gripper": "row and column of the gripper",

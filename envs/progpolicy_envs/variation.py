@@ -6,20 +6,31 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from numbers import Integral
-from typing import Any
+from typing import Any, ClassVar
 
 Variation = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class IntParameter:
-    """A whole number between ``low`` and ``high``, both included, or one of the ``names``."""
+    """A whole number between ``low`` and ``high``, both included, or one of the ``names``.
+
+    :param name: as in the constructor and in ``reset(options=...)``
+    :param low: smallest number
+    :param high: largest number
+    :param default: of the constructor
+    :param description: in a few words
+    :param names: accepted in place of a number
+    """
 
     name: str
     low: int
     high: int
+    default: int | str
     description: str
     names: tuple[str, ...] = ()
+
+    kind: ClassVar[str] = "integer"
 
     @property
     def allowed(self) -> str:
@@ -41,11 +52,20 @@ class IntParameter:
 
 @dataclass(frozen=True)
 class ChoiceParameter:
-    """One of a fixed set of names."""
+    """One of a fixed set of names.
+
+    :param name: as in the constructor and in ``reset(options=...)``
+    :param choices: the names
+    :param default: of the constructor
+    :param description: in a few words
+    """
 
     name: str
     choices: tuple[str, ...]
+    default: str
     description: str
+
+    kind: ClassVar[str] = "choice"
 
     @property
     def allowed(self) -> str:
@@ -116,11 +136,23 @@ class VariationSpace(Mapping[str, Parameter]):
         :raises ValueError: if a name is unknown, a value is not accepted, or the values do not fit together; the
             message names the parameter, the value and what is allowed
         """
-        parsed = {name: self._named(name).parse(value) for name, value in (changes or {}).items()}
-        updated = {**variation, **parsed}
+        updated = {**variation, **self.parse(changes or {})}
         if self._check:
             self._check(updated)
         return updated
+
+    def parse(self, values: Mapping[str, Any]) -> Variation:
+        """Return values as the types they have to be of; not all parameters need one.
+
+        :param values: by parameter name
+        :raises ValueError: if a name is unknown or a value is not accepted
+        """
+        return {name: self._named(name).parse(value) for name, value in values.items()}
+
+    @property
+    def defaults(self) -> Variation:
+        """The variation of an environment that is made without arguments."""
+        return {name: parameter.default for name, parameter in self.items()}
 
     def _named(self, name: str) -> Parameter:
         if name not in self._parameters:

@@ -9,7 +9,7 @@ from sb3_progpolicy.cli.streams import quiet_stdout
 
 
 def envs() -> None:
-    """List the environments with their parameters, training variations and unseen variations."""
+    """List the environments with their parameters and their training, validation and unseen variations."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -17,7 +17,7 @@ def envs() -> None:
     from progpolicy_envs import DOMAINS
 
     table = Table(show_lines=True)
-    for name in ("environment", "parameters", "trained on", "unseen"):
+    for name in ("environment", "parameters", "trained on", "validation", "unseen"):
         table.add_column(name, overflow="fold")
     for domain in DOMAINS.values():
         try:
@@ -29,6 +29,7 @@ def envs() -> None:
             domain.id,
             escape("\n".join(parameters)),
             _listed(domain.train),
+            _listed(domain.validation),
             _listed(domain.unseen),
         )
     Console().print(table)

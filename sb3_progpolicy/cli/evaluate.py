@@ -35,7 +35,7 @@ def evaluate(
 ) -> None:
     """Measure success and steps on variations, next to the steps of the domain's planner.
 
-    An episode that fails counts as the cap, 500 steps. Without --set: the domain's training sizes and what is unseen.
+    An episode that fails counts as the cap, 500 steps. Without --set: the domain's training sizes and all larger ones.
     """
     if semantics not in (*SEMANTICS, "both"):
         raise unknown("semantics", semantics, (*SEMANTICS, "both"))

@@ -93,9 +93,9 @@ def check_folder(output: Path) -> None:
 
 
 def default_variations(env_id: str) -> list[dict[str, Any]]:
-    """Return a domain's training sizes and its unseen variations, or the environment as it is for any other id."""
+    """Return a domain's training sizes and all larger variations, or the environment as it is for any other id."""
     domain = DOMAINS.get(env_id.rpartition(":")[2])
     if domain is None:
         return [{}]
     sizes = [{domain.size: size} for size in dict.fromkeys(variation[domain.size] for variation in domain.train)]
-    return [*sizes, *domain.unseen]
+    return [*sizes, *domain.validation, *domain.unseen]

@@ -23,7 +23,7 @@ def resident_bytes() -> int:
 @pytest.mark.parametrize("domain", DOMAINS.values(), ids=lambda domain: domain.id)
 def test_memory_is_flat_over_a_thousand_resets(domain) -> None:
     env = gym.make(domain.id)
-    variations = [*domain.train, *domain.unseen]
+    variations = [*domain.train, *domain.validation, *domain.unseen]
 
     def resets(number: int) -> None:
         for seed in range(number):

@@ -10,7 +10,8 @@ from progpolicy_envs import DOMAINS
 from progpolicy_envs.variation import ChoiceParameter, IntParameter, VariationSpace
 
 SPACE = VariationSpace(
-    IntParameter("n_discs", 1, 12, "number of discs"), ChoiceParameter("layout", ("fork", "bends"), "the map")
+    IntParameter("n_discs", 1, 12, 3, "number of discs"),
+    ChoiceParameter("layout", ("fork", "bends"), "fork", "the map"),
 )
 
 

@@ -29,7 +29,7 @@ def planning(n_seeds: int) -> None:
     print(f"{'domain':<26}{'branches':>9}{'set':>8}{'success':>9}{'steps':>8}{'planner':>9}{'ratio':>7}")
     for program in (hanoi_program(), map_program(), egocentric_program(), stacking_program()):
         domain = get_domain(program.metadata["env"])
-        for part, variations in (("train", domain.train), ("unseen", domain.unseen)):
+        for part, variations in (("train", domain.train), ("validation", domain.validation), ("unseen", domain.unseen)):
             episodes = [
                 episode for variation in variations for episode in play_batch(program, domain.id, n_seeds, **variation)
             ]
@@ -53,7 +53,7 @@ def panda(n_seeds: int, sizes: list[int]) -> list[str]:
         env = gym.make(env_id)
         for size in sizes:
             variation = {domain.size: size}
-            part = "train" if variation in domain.train else "unseen"
+            part = next(name for name in ("train", "validation", "unseen") if variation in getattr(domain, name))
             ours = [play(program, env, seed, **variation) for seed in range(n_seeds)]
             scripted = [play_plan(env, seed, **variation) for seed in range(n_seeds)]
             both = [(a.steps, b.steps) for a, b in zip(ours, scripted, strict=True) if a.success and b.success]

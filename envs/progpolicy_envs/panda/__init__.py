@@ -38,7 +38,7 @@ class _ObjectsEnv(PandaEnv):
     """What the three environments with objects have in common."""
 
     variations: ClassVar[VariationSpace] = VariationSpace(
-        IntParameter("n_objects", 1, MAX_OBJECTS, "number of objects"),
+        IntParameter("n_objects", 1, MAX_OBJECTS, 1, "number of objects"),
         starts={"starts": "x and y of each object, metres", "targets": "x and y of each target, metres"},
     )
 
@@ -91,7 +91,7 @@ class PandaReachEnv(PandaEnv):
 
     task_class: ClassVar[type[Task]] = Reach
     variations: ClassVar[VariationSpace] = VariationSpace(
-        IntParameter("n_targets", 1, MAX_OBJECTS, "number of targets"),
+        IntParameter("n_targets", 1, MAX_OBJECTS, 1, "number of targets"),
         starts={"targets": "x, y and z of each target, metres"},
     )
     controller: ClassVar[Callable[[FlatObservation], Action]] = staticmethod(controllers.reach)
