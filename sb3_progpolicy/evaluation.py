@@ -18,7 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from progpolicy_envs import DOMAINS
-from sb3_progpolicy.extraction import wrappers_of
+from sb3_progpolicy.extraction import extract_program, holds_program, wrappers_of
 from sb3_progpolicy.interaction import VecInteractionHistory
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.programs.interpreter import ProgramRunner, Semantics, join_inputs
@@ -161,6 +161,28 @@ def evaluate_model(
         return act
 
     return _evaluate(env_id, variations, n_episodes, None, seed, max_steps, env_kwargs, prepare, start)
+
+
+def evaluate_any(
+    model: BaseAlgorithm,
+    env_id: str,
+    variations: Sequence[Mapping[str, Any]] = ({},),
+    n_episodes: int = 1,
+    semantics: Sequence[Semantics] = ("soft", "crisp"),
+    **arguments: Any,
+) -> list[Evaluation]:
+    """Run a model on variations of an environment: its program if it is one, in each of the semantics, else itself.
+
+    See :func:`evaluate_program` and :func:`evaluate_model`.
+    """
+    if not holds_program(model):
+        return evaluate_model(model, env_id, variations, n_episodes, **arguments)
+    program = extract_program(model)
+    return [
+        row
+        for kind in semantics
+        for row in evaluate_program(program, env_id, variations, n_episodes, kind, **arguments)
+    ]
 
 
 def _refuse_wrappers(what: str, wrappers: Sequence[str]) -> None:

@@ -63,7 +63,7 @@ def zoo_hyperparams(algo: str) -> dict[str, dict[str, Any]]:
     """
     if algo not in _our_methods():
         raise unknown("algorithm", algo, _our_methods())
-    entries = load_entries(METHODS[algo].hyperparams)
+    entries = load_entries(algo)
     return {env_id: _translated(f"{algo}, {env_id}", entry) for env_id, entry in entries.items()}
 
 

@@ -21,7 +21,7 @@ def test_methods_have_settings_a_policy_and_a_source(name):
     method = get_method(name)
     assert method.name == name
     assert method.policy in method.all_policies
-    assert load_hyperparams(method.hyperparams, "CartPole-v1")["policy"] == method.policy
+    assert load_hyperparams(name, "CartPole-v1")["policy"] == method.policy
     assert method.source
     assert ("tasks" in inspect.signature(method.algorithm).parameters) == method.has_reptile
     with pytest.raises(dataclasses.FrozenInstanceError):

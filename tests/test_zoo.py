@@ -32,7 +32,7 @@ def test_train_with_evaluation_and_enjoy(tmp_path):
 
 @pytest.mark.parametrize("algo", OURS)
 def test_hyperparameters_are_ours_in_values_that_the_zoo_accepts(algo):
-    ours, translated = load_entries(METHODS[algo].hyperparams), zoo_hyperparams(algo)
+    ours, translated = load_entries(algo), zoo_hyperparams(algo)
     assert set(translated) == set(ours)
     for env_id, entry in translated.items():
         assert entry["interaction_history"] is False

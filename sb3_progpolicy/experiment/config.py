@@ -46,7 +46,11 @@ _BOUNDS = {
 }
 # Arguments of the constructors that have a flag of their own or no place in a file.
 _ELSEWHERE = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
-_ELSEWHERE |= {"rollout_buffer_class", "rollout_buffer_kwargs"}
+_ELSEWHERE |= {f"{kind}_buffer_{part}" for kind in ("rollout", "replay") for part in ("class", "kwargs")} | {
+    "action_noise"
+}
+# Texts that may be numbers, too.
+_TEXT_OR_NUMBER = ("ent_coef", "target_entropy", "goal_scale")
 
 
 @dataclass(frozen=True)
@@ -95,7 +99,7 @@ def make_config(
     :raises ValueError: if a name or a value is not accepted; the message names the nearest names
     """
     method = get_method(algo)
-    hyperparams = {**load_hyperparams(method.hyperparams, env_id), **(overrides or {})}
+    hyperparams = {**load_hyperparams(method.name, env_id), **(overrides or {})}
     if n_timesteps is not None:
         hyperparams["n_timesteps"] = n_timesteps
     env_kwargs = {**parse_kwargs("env_kwargs", hyperparams.pop("env_kwargs", None)), **(env_kwargs or {})}
@@ -185,8 +189,10 @@ def _accepted(algo: str) -> dict[str, Any]:
     signature = inspect.signature(method.algorithm.__init__).parameters
     accepted = {name: parameter.default for name, parameter in signature.items() if name not in _ELSEWHERE}
     if not method.has_reptile:
+        accepted["interaction_history"] = False
+    if method.takes_tasks and not method.has_reptile:
         reptile = inspect.signature(ReptileWrapper.__init__).parameters
-        accepted |= {name: reptile[name].default for name in REPTILE} | {"interaction_history": False}
+        accepted |= {name: reptile[name].default for name in REPTILE}
     accepted.pop("env_kwargs", None)
     return {**accepted, "policy": "", "tasks": None, "n_envs": DEFAULT_N_ENVS, "n_timesteps": 1}
 
@@ -214,6 +220,8 @@ def _checked(name: str, value: Any, default: Any) -> Any:
         return int(number)
     if isinstance(default, float) or name == "target_kl":
         return _number(name, value, "a number")
+    if name in _TEXT_OR_NUMBER and isinstance(default, str) and isinstance(value, (int, float)):
+        return _number(name, value, "a text or a number")
     if isinstance(default, str) and not isinstance(value, str):
         raise ValueError(f"{name}={shortened(value)} is not accepted; it is a text")
     return value

@@ -14,13 +14,14 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import yaml
 from filelock import FileLock, Timeout
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_progpolicy.experiment.config import RunConfig, parse_config
-from sb3_progpolicy.experiment.methods import get_method
+from sb3_progpolicy.experiment.methods import Method, get_method
 from sb3_progpolicy.extraction import extract_program, holds_program
 from sb3_progpolicy.hyperparams import read_yaml, shortened
 from sb3_progpolicy.programs.files import write_atomically
@@ -137,9 +138,7 @@ def read_config(folder: str | Path) -> RunConfig:
         raise ValueError(f"{path} does not describe a run: {error}") from None
 
 
-def load_model(
-    path: str | Path, env: VecEnv | None = None, allow_pickle: bool = False, **kwargs: Any
-) -> OnPolicyAlgorithm:
+def load_model(path: str | Path, env: VecEnv | None = None, allow_pickle: bool = False, **kwargs: Any) -> BaseAlgorithm:
     """Load a model saved by any of our algorithms: the one that the configuration next to it names, or ReptilePPO.
 
     :param path: a ``.zip`` file
@@ -152,7 +151,8 @@ def load_model(
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"{path} does not exist; a model is a .zip file")
-    method = get_method(read_config(path.parent).algo if (path.parent / CONFIG).is_file() else "reptile_ppo")
+    config = read_config(path.parent) if (path.parent / CONFIG).is_file() else None
+    method = get_method("reptile_ppo" if config is None else config.algo)
     if "allow_pickle" in inspect.signature(method.algorithm.load).parameters:
         kwargs["allow_pickle"] = allow_pickle
     elif not method.has_reptile and not allow_pickle:
@@ -160,7 +160,17 @@ def load_model(
             f"{path} is a model of {method.algorithm.__name__}, which is saved with pickle: loading it runs the code "
             "in it. If you trust the file, give --allow-pickle"
         )
-    return method.algorithm.load(path, env=env, **kwargs)
+    return _algorithm_of(method, config, env).load(path, env=env, **kwargs)
+
+
+def _algorithm_of(method: Method, config: RunConfig | None, env: VecEnv | None) -> type[BaseAlgorithm]:
+    """Return the algorithm of a method for the action space of a run's environment."""
+    if method.discrete is None or config is None:
+        return method.algorithm
+    if env is not None:
+        return method.algorithm_for(env.action_space)
+    with contextlib.closing(gym.make(config.env, **config.env_kwargs)) as single:
+        return method.algorithm_for(single.action_space)
 
 
 def timesteps_of(path: Path) -> int | None:
@@ -179,7 +189,7 @@ def timesteps_of(path: Path) -> int | None:
         return None
 
 
-def save_results(folder: Path, model: OnPolicyAlgorithm) -> None:
+def save_results(folder: Path, model: BaseAlgorithm) -> None:
     """Write the model and, if it is one, its program to a run folder.
 
     A reader finds out whether a process was killed between the two: both tell their number of steps.

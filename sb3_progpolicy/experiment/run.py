@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from progpolicy_envs import DOMAINS
-from sb3_progpolicy.evaluation import evaluate_model, evaluate_program
+from sb3_progpolicy.evaluation import evaluate_any
 from sb3_progpolicy.experiment.config import REPTILE, RunConfig, check_surroundings, parse_schedule
 from sb3_progpolicy.experiment.folder import (
     EVALUATIONS,
@@ -43,7 +43,7 @@ from sb3_progpolicy.vec_env.worker import WorkerDiedError, interrupts_deferred
 
 def build_model(
     config: RunConfig, tensorboard_log: str | None = None, verbose: int = 0
-) -> tuple[OnPolicyAlgorithm, ReptileWrapper | None]:
+) -> tuple[BaseAlgorithm, ReptileWrapper | None]:
     """Make the model that a configuration describes.
 
     :param config: from :func:`~sb3_progpolicy.experiment.config.make_config`
@@ -65,7 +65,8 @@ def build_model(
         wrapper = _reptile_wrapper(config, reptile) if reptile else None
         for name in ("n_envs", "interaction_history"):
             arguments.pop(name, None)
-        return method.algorithm(method.policies.get(policy, policy), make_env(config), **arguments), wrapper
+        env = make_env(config)
+        return method.algorithm_for(env.action_space)(method.policies.get(policy, policy), env, **arguments), wrapper
     except ValueError:
         raise
     except Exception as error:  # for a value of the wrong kind environments, SB3 and torch raise whatever they please
@@ -160,7 +161,7 @@ def terminable() -> Iterator[None]:
 
 
 def train(
-    model: OnPolicyAlgorithm,
+    model: BaseAlgorithm,
     config: RunConfig,
     folder: Path,
     wrapper: ReptileWrapper | None = None,
@@ -197,7 +198,7 @@ def train(
     save_results(folder, model)
 
 
-def _saved(model: OnPolicyAlgorithm, folder: Path, checkpoint: _RunCheckpoint | None, reason: str = "") -> Interrupted:
+def _saved(model: BaseAlgorithm, folder: Path, checkpoint: _RunCheckpoint | None, reason: str = "") -> Interrupted:
     """Save what was reached and return what says so."""
     with interrupts_deferred():
         if checkpoint is not None:
@@ -209,7 +210,7 @@ def _saved(model: OnPolicyAlgorithm, folder: Path, checkpoint: _RunCheckpoint | 
 
 def resume(
     folder: Path, n_timesteps: int | None = None, verbose: int = 0, allow_pickle: bool = False
-) -> tuple[OnPolicyAlgorithm, RunConfig]:
+) -> tuple[BaseAlgorithm, RunConfig]:
     """Load a run to go on from its last checkpoint, or make its model anew if it was stopped before the first.
 
     :func:`train` then ends as if the run had never stopped.
@@ -241,7 +242,7 @@ def resume(
     return model, config
 
 
-def start_from(model: OnPolicyAlgorithm, trained: str | Path, allow_pickle: bool = False) -> None:
+def start_from(model: BaseAlgorithm, trained: str | Path, allow_pickle: bool = False) -> None:
     """Take the parameters of a trained model as the initial ones.
 
     :param model: a new model
@@ -281,10 +282,7 @@ class _EvaluateVariations(BaseCallback):
             return
         self._next = self.num_timesteps + self.options.eval_freq
         model, arguments = self.model, (self.config.env, self.variations, self.options.eval_episodes)
-        if holds_program(model):
-            rows = evaluate_program(extract_program(model), *arguments, env_kwargs=self.config.env_kwargs)
-        else:
-            rows = evaluate_model(model, *arguments, env_kwargs=self.config.env_kwargs)
+        rows = evaluate_any(model, *arguments, semantics=("crisp",), env_kwargs=self.config.env_kwargs)
         self._kept += [{"timesteps": self.num_timesteps, **row.to_json()} for row in rows]
         write_atomically(self.path, json.dumps(self._kept, indent=1) + "\n")
         self.logger.record("eval/success_rate", sum(row.success_rate for row in rows) / len(rows))

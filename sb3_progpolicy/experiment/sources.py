@@ -11,7 +11,7 @@ from sb3_progpolicy.pretrained import load_pretrained, pretrained_names
 from sb3_progpolicy.programs.program import Program, load_program
 
 if TYPE_CHECKING:
-    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+    from stable_baselines3.common.base_class import BaseAlgorithm
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Source:
     name: str
     env_id: str | None
     program: Program | None
-    model: OnPolicyAlgorithm | None
+    model: BaseAlgorithm | None
     env_kwargs: dict[str, Any]
 
 

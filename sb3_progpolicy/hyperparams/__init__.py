@@ -12,7 +12,7 @@ import yaml
 
 from sb3_progpolicy.nearest import unknown
 
-DEFAULT = "default"
+DEFAULT, SEARCH = "default", "search"
 #: Bounds far above what real files have; damaged or hostile ones would take memory or end in a traceback.
 MAX_CHARACTERS, MAX_ITEMS, MAX_DEPTH = 1_000_000, 10_000, 20
 
@@ -41,11 +41,30 @@ def load_hyperparams(algo: str, env_id: str) -> dict[str, Any]:
 
 
 def load_entries(algo: str) -> dict[str, Any]:
-    """Read the whole file of an algorithm: hyperparameters by environment id, and ``default``.
+    """Read the hyperparameters of an algorithm by environment id, and ``default``.
 
     :param algo: one of :func:`algorithms`
     :raises ValueError: if the file is damaged
     """
+    return {name: entry for name, entry in _read_file(algo).items() if name != SEARCH}
+
+
+def load_search(algo: str) -> dict[str, Any]:
+    """Read what to try when the hyperparameters of an algorithm are tuned.
+
+    :param algo: one of :func:`algorithms`
+    :return: by name, or ``policy_kwargs.<name>``, a list of values or a mapping of ``low``, ``high`` and ``log``
+    :raises ValueError: if the algorithm is not known or its file is damaged
+    """
+    if algo not in algorithms():
+        raise unknown("algorithm", algo, algorithms())
+    search = _read_file(algo).get(SEARCH, {})
+    if not isinstance(search, dict):
+        raise ValueError(f"{algo}.yml: {SEARCH} is not a mapping from hyperparameters to what to try")
+    return search
+
+
+def _read_file(algo: str) -> dict[str, Any]:
     file = files(__name__) / f"{algo}.yml"
     try:
         entries = read_yaml(file.read_text(encoding="utf-8"))

@@ -23,6 +23,8 @@ from sb3_progpolicy.baselines.hiro.buffer import GoalReplayBuffer
 from sb3_progpolicy.baselines.hiro.learning import EntropyCoefficient, high_batch, low_batch, low_step, measured_scale
 from sb3_progpolicy.baselines.hiro.policies import GoalState, HIROPolicy
 from sb3_progpolicy.finite import check_parameters, check_step, check_update
+from sb3_progpolicy.interaction import appends_history
+from sb3_progpolicy.spaces import action_spec
 
 SelfHIRO = TypeVar("SelfHIRO", bound="HIRO")
 
@@ -67,7 +69,7 @@ class HIRO(OffPolicyAlgorithm):
     :param target_policy_noise: standard deviation of the noise on the target actors' actions
     :param target_noise_clip: bound of that noise
     :param goal_period: steps under one goal, the paper's c
-    :param goal_dims: indices of the observation that goals address; all by default
+    :param goal_dims: indices of the observation that goals address; all by default, but for an interaction history
     :param goal_scale: largest goal along each of them, in the observation's units, one number or one for each;
         ``"auto"`` for twice the largest change seen over ``goal_period`` of the first steps. Along what has not changed
         there are no goals
@@ -197,7 +199,10 @@ class HIRO(OffPolicyAlgorithm):
     def _checked_dims(self) -> list[int]:
         assert self.observation_space.shape is not None
         size = self.observation_space.shape[0]
-        dims = list(range(size)) if self.goal_dims is None else [int(dim) for dim in self.goal_dims]
+        history = 0
+        if self.env is not None and appends_history(self.env):
+            history = action_spec(self.action_space).interaction_size
+        dims = list(range(size - history)) if self.goal_dims is None else [int(dim) for dim in self.goal_dims]
         if not dims or len(set(dims)) < len(dims) or not all(0 <= dim < size for dim in dims):
             raise ValueError(
                 f"goal_dims={self.goal_dims!r} is not accepted; it has one or more different indices of the "
