@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sb3_progpolicy.cli import envs, evaluate, play, render, show, train, tune
+from sb3_progpolicy.cli import benchmark, envs, evaluate, play, render, show, train, tune
 from sb3_progpolicy.cli.parsing import repeat_flags
 from sb3_progpolicy.nearest import unknown
 
@@ -49,6 +49,10 @@ def _aborting(command: Callable[..., None]) -> Callable[..., None]:
 
 for _name, _command in COMMANDS.items():
     app.command(_name)(_aborting(_command))
+_benchmark = typer.Typer(help=benchmark.__doc__, no_args_is_help=True)
+for _name, _command in benchmark.COMMANDS.items():
+    _benchmark.command(_name)(_aborting(_command))
+app.add_typer(_benchmark, name="benchmark")
 
 
 def _show_version(wanted: bool) -> None:
@@ -87,8 +91,8 @@ def run(arguments: Sequence[str]) -> int:
     """
     given = list(arguments) or ["--help"]
     try:
-        if given and not given[0].startswith("-") and given[0] not in COMMANDS:
-            raise unknown("command", given[0], COMMANDS)
+        if given and not given[0].startswith("-") and given[0] not in (*COMMANDS, "benchmark"):
+            raise unknown("command", given[0], (*COMMANDS, "benchmark"))
         code = app(repeat_flags(given), prog_name="progpolicy", standalone_mode=False)
     except _ParserError as error:
         _say(error.format_message())  # type: ignore[attr-defined]

@@ -49,7 +49,7 @@ def train(
         str, typer.Option("-tb", "--tensorboard-log", help="folder of the TensorBoard logs")
     ] = "",
     eval_freq: Annotated[
-        int, typer.Option("--eval-freq", help="steps between evaluations on the training variations; negative: none")
+        int, typer.Option("--eval-freq", help="steps between evaluations on the validation variations; negative: none")
     ] = -1,
     eval_episodes: Annotated[int, typer.Option("--eval-episodes", min=1, help="on each variation")] = 5,
     save_freq: Annotated[int, typer.Option("--save-freq", help="steps between checkpoints; negative: none")] = 50_000,

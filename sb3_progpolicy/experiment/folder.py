@@ -50,21 +50,18 @@ def create_run(log_folder: str | Path, config: RunConfig, arguments: Mapping[str
             break
         except FileExistsError:
             number += 1
-    packages = ("sb3-progpolicy", "torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy")
-    versions = {"python": platform.python_version(), **{package: _version(package) for package in packages}}
-    write_atomically(folder / VERSIONS, yaml.safe_dump(versions, sort_keys=False))
     describe_run(folder, config, arguments)
     return folder
 
 
 def describe_run(folder: Path, config: RunConfig, arguments: Mapping[str, Any]) -> None:
-    """Write a run's options and configuration; the configuration, which makes it a run folder, comes last.
+    """Write versions, options and configuration of a run; the configuration, which makes it a run folder, comes last.
 
     :param folder: of the run
     :param config: what is run
     :param arguments: the command line's options
     """
-    for file, content in {ARGUMENTS: dict(arguments), CONFIG: asdict(config)}.items():
+    for file, content in {VERSIONS: versions(), ARGUMENTS: dict(arguments), CONFIG: asdict(config)}.items():
         write_atomically(folder / file, yaml.safe_dump(content, sort_keys=False))
 
 
@@ -94,21 +91,28 @@ def read_arguments(folder: str | Path) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def locked(folder: str | Path) -> Iterator[None]:
+def locked(folder: str | Path, wait: float = 0) -> Iterator[None]:
     """Keep other processes from training in a run folder; the lock ends with this process, however that ends.
 
     :param folder: of the run
+    :param wait: seconds to wait for another process
     :raises ValueError: if another process has it
     """
     lock = FileLock(Path(folder) / LOCK)
     try:
-        lock.acquire(timeout=0)
+        lock.acquire(timeout=wait)
     except Timeout:
         raise ValueError(f"{folder} is in use: another process trains in it") from None
     try:
         yield
     finally:
         lock.release()
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that decide what comes of a training."""
+    packages = ("sb3-progpolicy", "torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy")
+    return {"python": platform.python_version(), **{package: _version(package) for package in packages}}
 
 
 def _version(package: str) -> str:

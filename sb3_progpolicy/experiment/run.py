@@ -7,7 +7,7 @@ import json
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -94,8 +94,9 @@ class TrainingOptions:
 
     :param progress: show a progress bar
     :param save_freq: environment steps between two checkpoints; negative for none
-    :param eval_freq: environment steps between two evaluations on the training variations; negative for none
+    :param eval_freq: environment steps between two evaluations on the validation variations; negative for none
     :param eval_episodes: episodes of an evaluation, on each variation
+    :param eval_max_steps: cap on the steps of an evaluated episode; ``None`` for the registered one
     :param log_interval: rollouts between two lines of the log
     """
 
@@ -103,6 +104,7 @@ class TrainingOptions:
     save_freq: int = 50_000
     eval_freq: int = -1
     eval_episodes: int = 5
+    eval_max_steps: int | None = None
     log_interval: int = 10
 
 
@@ -166,6 +168,7 @@ def train(
     folder: Path,
     wrapper: ReptileWrapper | None = None,
     options: TrainingOptions = TrainingOptions(),
+    callbacks: Sequence[BaseCallback] = (),
 ) -> None:
     """Train a new or a loaded model up to its number of steps and save what comes of it.
 
@@ -174,10 +177,11 @@ def train(
     :param folder: of the run
     :param wrapper: from :func:`build_model`
     :param options: what to do besides
+    :param callbacks: of SB3, besides those that train and save
     :raises Interrupted: after an interrupt (Ctrl-C), or when a worker process has died; then all is saved
     """
     checkpoint: _RunCheckpoint | None = None
-    callbacks: list[BaseCallback] = [] if wrapper is None else [wrapper]
+    callbacks = [*callbacks, *([] if wrapper is None else [wrapper])]
     if METHODS[config.algo].has_reptile:
         checkpoint = _RunCheckpoint(folder, config, options.save_freq)
         callbacks.append(checkpoint)
@@ -259,14 +263,14 @@ def start_from(model: BaseAlgorithm, trained: str | Path, allow_pickle: bool = F
 
 
 class _EvaluateVariations(BaseCallback):
-    """Evaluates on the training variations, between two tasks where there are tasks; logs and keeps the results."""
+    """Evaluates on the validation variations, between two tasks where there are tasks; logs and keeps the results."""
 
     def __init__(self, config: RunConfig, options: TrainingOptions, path: Path, wrapper: ReptileWrapper | None) -> None:
         super().__init__()
         self.config, self.options, self.path, self.wrapper = config, options, path, wrapper
         self._meta_iteration: int | None = None
         domain = DOMAINS.get(config.env.rpartition(":")[2])
-        self.variations = [{}] if domain is None else list(domain.train)
+        self.variations = [{}] if domain is None else list(domain.validation)
         self._next = 0
         self._kept: list[dict[str, Any]] = []
 
@@ -274,6 +278,7 @@ class _EvaluateVariations(BaseCallback):
         if self.num_timesteps and self.path.is_file():
             kept = json.loads(self.path.read_text(encoding="utf-8"))
             self._kept = [row for row in kept if row["timesteps"] < self.num_timesteps]
+            self._next = max((row["timesteps"] for row in self._kept), default=0) + self.options.eval_freq
 
     def _on_rollout_start(self) -> None:
         before, self._meta_iteration = self._meta_iteration, getattr(self.wrapper or self.model, "meta_iteration", None)
@@ -282,7 +287,13 @@ class _EvaluateVariations(BaseCallback):
             return
         self._next = self.num_timesteps + self.options.eval_freq
         model, arguments = self.model, (self.config.env, self.variations, self.options.eval_episodes)
-        rows = evaluate_any(model, *arguments, semantics=("crisp",), env_kwargs=self.config.env_kwargs)
+        rows = evaluate_any(
+            model,
+            *arguments,
+            semantics=("crisp",),
+            max_steps=self.options.eval_max_steps,
+            env_kwargs=self.config.env_kwargs,
+        )
         self._kept += [{"timesteps": self.num_timesteps, **row.to_json()} for row in rows]
         write_atomically(self.path, json.dumps(self._kept, indent=1) + "\n")
         self.logger.record("eval/success_rate", sum(row.success_rate for row in rows) / len(rows))

@@ -43,15 +43,24 @@ def save_program(program: ProgramData, path: str | os.PathLike[str]) -> None:
 
 def read_program(path: str | os.PathLike[str]) -> ProgramData:
     """Read and check a file; see :func:`~sb3_progpolicy.programs.load_program`."""
+    with Path(path).open("rb") as handle:
+        return parse_program(handle.read(MAX_BYTES + 1), os.fspath(path))
+
+
+def parse_program(raw: bytes, name: str = "this") -> ProgramData:
+    """Return the program that a file holds, checked like a file's.
+
+    :param raw: content of the file
+    :param name: of the file, for the error message
+    :raises ProgramFormatError: naming the fault, if it is not a well-formed program
+    """
     try:
-        with Path(path).open("rb") as handle:
-            raw = handle.read(MAX_BYTES + 1)
         program = _from_json(_parse(raw))
         check_program(program)
     except RecursionError:
-        raise ProgramFormatError(f"{os.fspath(path)}: not a program file: nested too deeply") from None
+        raise ProgramFormatError(f"{name}: not a program file: nested too deeply") from None
     except ValueError as error:
-        raise ProgramFormatError(f"{os.fspath(path)}: not a program file: {error}") from None
+        raise ProgramFormatError(f"{name}: not a program file: {error}") from None
     return program
 
 
