@@ -65,7 +65,7 @@ def means(scores: Mapping[str, Scores], looks: Mapping[str, dict[str, Any]]) -> 
         axes.plot([interval.value] * 2, [place - 0.4, place + 0.4], color=looks[method]["color"], linewidth=2.5)
     axes.set_yticks(range(len(scores)), list(scores)[::-1])
     axes.set_xlim(0, 1.02)
-    axes.set_xlabel("planner's steps over steps taken, interquartile mean on unseen variations")
+    axes.set_xlabel("planner's steps over steps taken (interquartile mean, unseen)")
     axes.grid(axis="x", alpha=0.3)
     return figure
 

@@ -263,7 +263,10 @@ def start_from(model: BaseAlgorithm, trained: str | Path, allow_pickle: bool = F
 
 
 class _EvaluateVariations(BaseCallback):
-    """Evaluates on the validation variations, between two tasks where there are tasks; logs and keeps the results."""
+    """Evaluates on the validation variations, between two tasks where there are tasks, and at the end.
+
+    The results are logged and kept in a file.
+    """
 
     def __init__(self, config: RunConfig, options: TrainingOptions, path: Path, wrapper: ReptileWrapper | None) -> None:
         super().__init__()
@@ -283,13 +286,19 @@ class _EvaluateVariations(BaseCallback):
     def _on_rollout_start(self) -> None:
         before, self._meta_iteration = self._meta_iteration, getattr(self.wrapper or self.model, "meta_iteration", None)
         in_a_task = before is not None and before == self._meta_iteration
-        if self.num_timesteps < self._next or in_a_task:
-            return
+        if self.num_timesteps >= self._next and not in_a_task:
+            self._evaluate()
+
+    def _on_training_end(self) -> None:
+        self._evaluate()
+
+    def _evaluate(self) -> None:
         self._next = self.num_timesteps + self.options.eval_freq
-        model, arguments = self.model, (self.config.env, self.variations, self.options.eval_episodes)
         rows = evaluate_any(
-            model,
-            *arguments,
+            self.model,
+            self.config.env,
+            self.variations,
+            self.options.eval_episodes,
             semantics=("crisp",),
             max_steps=self.options.eval_max_steps,
             env_kwargs=self.config.env_kwargs,
