@@ -155,7 +155,10 @@ def test_suite_is_run_once_and_exported(tmp_path, capsys):
     assert run(["benchmark", "export", str(store), "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
     assert len(rows) == 2 * 7
-    assert {(row["method"], row["env"], row["seed"]) for row in rows} == {("ppo", "Hanoi-v0", 0), ("ppo", "Hanoi-v0", 1)}
+    assert {(row["method"], row["env"], row["seed"]) for row in rows} == {
+        ("ppo", "Hanoi-v0", 0),
+        ("ppo", "Hanoi-v0", 1),
+    }
     assert {row["relation"] for row in rows if row["set"] == "train"} == {"easier", "trained", "extrapolated"}
     row = rows[0]
     assert row["command"] == "progpolicy benchmark run suite.yml --method ppo --env Hanoi-v0 --seed 0 --store one.db"
@@ -171,7 +174,9 @@ def test_suite_is_run_once_and_exported(tmp_path, capsys):
     assert run([*command, "--seed", "0"]) == 0
     assert run(["benchmark", "export", str(store), "--json"]) == 0
     changed = json.loads(capsys.readouterr().out)
-    assert {(row["seed"], row["episodes"]) for row in changed} == {(0, 2)}, "rows of the old configuration are not mixed in"
+    assert {(row["seed"], row["episodes"]) for row in changed} == {(0, 2)}, (
+        "rows of the old configuration are not mixed in"
+    )
 
     assert run(["benchmark", "export", str(store), "--curves"]) == 0
     header, *points = capsys.readouterr().out.splitlines()
@@ -344,7 +349,16 @@ def test_interrupted_run_gives_its_cells_back(tmp_path):
     suite = {**SMALL, "methods": {"ppo": {"n_timesteps": 100_000_000}}, "seeds": [0]}
     file, store = tmp_path / "suite.yml", tmp_path / "results.db"
     file.write_text(json.dumps(suite))
-    command = [sys.executable, "-c", "from sb3_progpolicy.cli import main; main()", "benchmark", "run", str(file), "--store", str(store)]
+    command = [
+        sys.executable,
+        "-c",
+        "from sb3_progpolicy.cli import main; main()",
+        "benchmark",
+        "run",
+        str(file),
+        "--store",
+        str(store),
+    ]
     runner = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 120
     while not list((tmp_path / "results.db.runs").glob("*/config.yml")):

@@ -188,11 +188,11 @@ def open_study(tuning: Tuning, storage: str | None, name: str | None = None) -> 
     :raises ValueError: if the study is of something else
     """
     import optuna
-    from optuna.storages import RDBStorage, RetryFailedTrialCallback
+    from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback
 
     database: Any = None
     if storage is not None:
-        retry: Callable[..., None] = RetryFailedTrialCallback(max_retry=3)
+        retry: Callable[..., None] = RetryHeartbeatStaleTrialCallback(max_retry=3)
         database = RDBStorage(storage, heartbeat_interval=HEARTBEAT, failed_trial_callback=retry)
     sampler = optuna.samplers.TPESampler(n_startup_trials=tuning.n_startup_trials, seed=tuning.seed)
     study = optuna.create_study(
