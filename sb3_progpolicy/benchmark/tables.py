@@ -135,8 +135,8 @@ def markdown(rows: Sequence[Row], planner: bool = True) -> str:
 
 LEGEND = (
     "\\* unseen: nothing was trained on it or chosen by it. ° the method was trained on it. Bold: the fewest steps, or "
-    "at most 2 % more. In brackets: multiple of the planner's steps, or [share of episodes solved] where some are not; a "
-    "failed episode counts as the cap. † a training ended at the limit on processor time. Programs are run crisp, as "
+    "at most 2 % more. In brackets: multiple of the planner's steps, or [share of episodes solved] where some are not; "
+    "a failed episode counts as the cap. † a training ended at the limit on processor time. Programs are run crisp, as "
     "they are read."
 )
 

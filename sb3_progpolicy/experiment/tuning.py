@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -188,12 +189,15 @@ def open_study(tuning: Tuning, storage: str | None, name: str | None = None) -> 
     :raises ValueError: if the study is of something else
     """
     import optuna
+    from optuna.exceptions import ExperimentalWarning
     from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback
 
     database: Any = None
     if storage is not None:
-        retry: Callable[..., None] = RetryHeartbeatStaleTrialCallback(max_retry=3)
-        database = RDBStorage(storage, heartbeat_interval=HEARTBEAT, failed_trial_callback=retry)
+        with warnings.catch_warnings():  # Optuna has called these experimental since 2021
+            warnings.simplefilter("ignore", ExperimentalWarning)
+            retry: Callable[..., None] = RetryHeartbeatStaleTrialCallback(max_retry=3)
+            database = RDBStorage(storage, heartbeat_interval=HEARTBEAT, failed_trial_callback=retry)
     sampler = optuna.samplers.TPESampler(n_startup_trials=tuning.n_startup_trials, seed=tuning.seed)
     study = optuna.create_study(
         storage=database,
