@@ -1,4 +1,4 @@
-"""The benchmark: suites are checked, cells are done once however they are interrupted, and reports say what was found."""
+"""The benchmark: suites are checked, and cells are done once however they are interrupted."""
 
 import json
 import multiprocessing
@@ -257,7 +257,7 @@ def test_result_counts_once_and_wholly(url):
     one, other = Store(url), Store(url)
     one.add(suite, ["first", "second"])
     assert one.claim(keys) == keys[0]
-    with pytest.raises(Exception, match="(?i)constraint"):  # the same row twice: nothing of the result is kept
+    with pytest.raises(Exception, match=r"(?i)constraint"):  # the same row twice: nothing of the result is kept
         one.finish(keys[0], CellResult(rows=[ROW, ROW]))
     assert one.statuses(keys)[keys[0]] == "running"
     assert one.rows("small") == []
