@@ -1,20 +1,22 @@
 """What the baselines reach, next to Stable-Baselines3's nearest algorithm where there is one.
 
-    python benchmarks/baselines.py cartpole [--seeds 3] [--steps 50000]
-    python benchmarks/baselines.py maze [--seeds 3] [--steps 40000]
-    python benchmarks/baselines.py reach [--seeds 3] [--steps 40000]
+    python benchmarks/baselines.py [cartpole] [maze] [reach] [--seeds 3]
 
 ``cartpole`` compares DiscreteSAC with SB3's DQN, whose settings are rl-baselines3-zoo's, on CartPole-v1; ``maze``
 compares HIRO with SB3's TD3 on a U-shaped corridor with its only reward at the far end (``point_maze.py``), both with
 as many gradient steps, networks and random steps; ``reach`` trains HIRO on PandaReach-v0 with one target. Each seed is
-evaluated on episodes never trained on, with the most likely actions; seconds are of this process, on one thread.
+evaluated on episodes never trained on, with the most likely actions; seconds are of the processor, on one thread. All
+go to ``results/baselines.csv``. A finished seed is kept in ``runs/``, so that an interrupted study goes on where it
+was.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,8 +28,12 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecEnv
+from study import write_results
 
 from sb3_progpolicy import HIRO, DiscreteSAC, make_fast_vec_env
+from sb3_progpolicy.programs.files import write_atomically
+
+COLUMNS = ("task", "algorithm", "seed", "steps", "return", "length", "success", "train_seconds")
 
 SMALL: dict[str, Any] = {"net_arch": [64, 64], "optimizer_kwargs": {"fused": True}}
 
@@ -105,11 +111,11 @@ def reach() -> tuple[Make, list[Contender]]:
     return lambda seed: make_fast_vec_env("PandaReach-v0", 8, seed=seed, n_targets=1), [Contender("HIRO", HIRO, REACH)]
 
 
-TASKS = {"cartpole": (cartpole, 50_000, 100), "maze": (maze, 40_000, 40), "reach": (reach, 40_000, 40)}
+TASKS = {"cartpole": (cartpole, 50_000, 100), "maze": (maze, 40_000, 40), "reach": (reach, 40_000, 100)}
 
 
-def evaluate(model: BaseAlgorithm, env: VecEnv, n_episodes: int) -> tuple[float, float, float]:
-    """Return mean return, mean length and share of successes, NaN where the environment reports none."""
+def evaluate(model: BaseAlgorithm, env: VecEnv, n_episodes: int) -> dict[str, float | None]:
+    """Return mean return, mean length and share of successes, the last ``None`` where the environment reports none."""
     successes: list[bool] = []
 
     def note(local: dict[str, Any], _: dict[str, Any]) -> None:
@@ -119,34 +125,66 @@ def evaluate(model: BaseAlgorithm, env: VecEnv, n_episodes: int) -> tuple[float,
     returns, lengths = evaluate_policy(
         model, env, n_episodes, deterministic=True, callback=note, return_episode_rewards=True, warn=False
     )
-    return float(np.mean(returns)), float(np.mean(lengths)), float(np.mean(successes)) if successes else float("nan")
+    return {
+        "return": round(float(np.mean(returns)), 2),
+        "length": round(float(np.mean(lengths)), 1),
+        "success": round(float(np.mean(successes)), 3) if successes else None,
+    }
+
+
+def run_seed(task: str, contender: Contender, seed: int, folder: Path) -> dict[str, Any]:
+    """Return the row of one seed, trained now or read from ``folder``.
+
+    :param task: one of ``TASKS``
+    :param contender: that is trained
+    :param seed: of training; episodes of evaluation have another
+    :param folder: where rows are kept, so that an interrupted study goes on where it was
+    """
+    build, steps, episodes = TASKS[task]
+    make, _ = build()
+    path = folder / f"{task}_{contender.name.lower().replace(', ', '_').replace(' ', '_')}_{seed}.json"
+    settings = f"{steps} {episodes} {contender.settings}"
+    if path.exists() and (kept := json.loads(path.read_text()))["settings"] == settings:
+        row: dict[str, Any] = kept["row"]
+        return row
+    started = time.process_time()
+    model = contender.algorithm("MlpPolicy", make(seed), seed=seed, device="cpu", **contender.settings)
+    model.learn(steps)
+    seconds = round(time.process_time() - started, 1)
+    scores = evaluate(model, make(10_000 + seed), episodes)
+    row = {"task": task, "algorithm": contender.name, "seed": seed, "steps": model.num_timesteps}
+    row = {**row, **scores, "train_seconds": seconds}
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, json.dumps({"settings": settings, "row": row}))
+    return row
+
+
+def run(tasks: list[str], seeds: int, only: str, folder: Path) -> Iterator[dict[str, Any]]:
+    """Yield the rows of all contenders whose name starts with ``only``."""
+    for task in tasks:
+        for contender in TASKS[task][0]()[1]:
+            if contender.name.startswith(only):
+                yield from (run_seed(task, contender, seed, folder) for seed in range(seeds))
 
 
 def main() -> None:
-    """Train and evaluate every contender with every seed."""
+    """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("task", choices=TASKS)
+    parser.add_argument(
+        "tasks", nargs="*", default=list(TASKS), metavar="task", help=f"of {', '.join(TASKS)}; all by default"
+    )
     parser.add_argument("--seeds", type=int, default=3, help="number of seeds, from 0 on")
-    parser.add_argument("--steps", type=int, help="environment steps of training; by default what the task needs")
-    parser.add_argument("--episodes", type=int, help="episodes of evaluation")
-    parser.add_argument("--only", help="contenders whose name starts so")
-    parser.add_argument("--progress", action="store_true", help="show a progress bar of each training")
-    arguments = parser.parse_args()
+    parser.add_argument("--only", default="", help="contenders whose name starts so")
+    parser.add_argument("--name", default="baselines", help="name of the result files")
+    options = parser.parse_args()
+    if unknown := set(options.tasks) - set(TASKS):
+        parser.error(f"there is no task {', '.join(sorted(unknown))}; there are {', '.join(TASKS)}")
     th.set_num_threads(1)
-    build, steps, episodes = TASKS[arguments.task]
-    make, contenders = build()
-    print("| algorithm | seed | steps | return | length | success | seconds |", "|---" * 7 + "|", sep="\n", flush=True)
-    for contender in contenders:
-        if arguments.only and not contender.name.startswith(arguments.only):
-            continue
-        for seed in range(arguments.seeds):
-            started = time.process_time()
-            model = contender.algorithm("MlpPolicy", make(seed), seed=seed, device="cpu", **contender.settings)
-            model.learn(arguments.steps or steps, progress_bar=arguments.progress)
-            seconds = time.process_time() - started
-            scores = evaluate(model, make(10_000 + seed), arguments.episodes or episodes)
-            cells = [contender.name, seed, model.num_timesteps, *(f"{score:.2f}" for score in scores), f"{seconds:.0f}"]
-            print("| " + " | ".join(map(str, cells)) + " |", flush=True)
+    rows = []
+    for row in run(options.tasks, options.seeds, options.only, Path("runs") / options.name):
+        rows.append(row)
+        print(*(f"{key}={value}" for key, value in row.items()), flush=True)
+        write_results(options.name, COLUMNS, rows, {})
 
 
 if __name__ == "__main__":
