@@ -155,6 +155,8 @@ def test_images_and_dictionaries_have_policies():
     ("arguments", "message"),
     [
         ({"ent_coef": "automatic"}, "ent_coef='automatic' is not accepted; it is a number"),
+        ({"ent_coef": "auto_"}, "ent_coef='auto_' is not accepted"),
+        ({"n_steps": 0}, "n_steps=0 is not accepted; it is at least 1"),
         ({"ent_coef": "auto_-1"}, "ent_coef='auto_-1' is not accepted"),
         ({"ent_coef": -1.0}, "ent_coef=-1.0 is not accepted; it is at least 0"),
         ({"target_entropy": 0.7}, "target_entropy=0.7 is not accepted; it is at least 0 and at most 0.693147"),
@@ -178,6 +180,13 @@ def test_training_stops_at_a_reward_that_is_not_finite():
     model = DiscreteSAC("MlpPolicy", make_vec_env(lambda: Bandit(reward=np.nan), 2, seed=0), **SMALL)
     with pytest.raises(FloatingPointError, match=r"reward of environment \d is not finite"):
         model.learn(50)
+
+
+def test_loss_that_is_not_finite_does_not_reach_the_parameters():
+    model = DiscreteSAC("MlpPolicy", make_vec_env(lambda: Bandit(reward=1e25), 2, seed=0), **SMALL)
+    with pytest.raises(FloatingPointError, match="the loss is not finite"):
+        model.learn(50)  # the square of the reward is too large for a float
+    assert all(bool(th.isfinite(parameter).all()) for parameter in model.policy.parameters())
 
 
 def test_no_action_follows_from_an_observation_that_is_not_finite():
