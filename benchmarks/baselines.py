@@ -53,10 +53,11 @@ ZOO_DQN: dict[str, Any] = {
 }
 CARTPOLE_SAC: dict[str, Any] = {
     "learning_rate": 1e-3,
-    "batch_size": 128,
+    "batch_size": 64,
+    "tau": 0.01,
     "learning_starts": 1_000,
     "train_freq": 4,
-    "gradient_steps": 4,
+    "gradient_steps": 2,
     "policy_kwargs": SMALL,
 }
 MAZE: dict[str, Any] = {"gradient_steps": 4, "batch_size": 128, "tau": 0.02, "policy_kwargs": SMALL}
@@ -65,12 +66,13 @@ HIRO_SETTINGS: dict[str, Any] = {**MAZE, "low_gamma": 0.9, "high_gradient_steps"
 MAZE_HIRO: dict[str, Any] = {**HIRO_SETTINGS, "high_learning_starts": RANDOM_STEPS}
 REACH: dict[str, Any] = {
     **HIRO_SETTINGS,
-    "goal_dims": [26, 27, 28],  # where the hand is
+    "goal_dims": [0, 1, 2],  # where the gripper is
     "learning_starts": 2_000,
     "high_learning_starts": 6_000,
 }
 
-Make = Callable[[int], VecEnv]
+EVALUATION_ENVS = 10
+EVALUATION_SEED = 10_000
 
 
 class Contender(NamedTuple):
@@ -81,37 +83,49 @@ class Contender(NamedTuple):
     settings: dict[str, Any]
 
 
-def maze_td3(noise: float) -> dict[str, Any]:
-    """Return settings of TD3 with some exploration noise."""
-    return {
+class Task(NamedTuple):
+    """Environments, given a number of them and a seed, and what is trained in how many of them and for how long."""
+
+    make: Callable[[int, int], VecEnv]
+    n_envs: int
+    steps: int
+    episodes: int
+    contenders: list[Contender]
+
+
+def maze_td3(noise: float) -> Contender:
+    """Return TD3 with some exploration noise."""
+    settings = {
         **MAZE,
         "learning_starts": RANDOM_STEPS,
         "action_noise": NormalActionNoise(np.zeros(2), np.full(2, noise)),
     }
+    return Contender(f"TD3, noise {noise:g}", TD3, settings)
 
 
-def cartpole() -> tuple[Make, list[Contender]]:
-    """DiscreteSAC and DQN on CartPole-v1."""
-    contenders = [Contender("DiscreteSAC", DiscreteSAC, CARTPOLE_SAC), Contender("DQN", DQN, ZOO_DQN)]
-    return lambda seed: make_vec_env("CartPole-v1", 1, seed=seed), contenders
-
-
-def maze() -> tuple[Make, list[Contender]]:
-    """HIRO and TD3 in the corridor."""
-    contenders = [
-        Contender("HIRO", HIRO, MAZE_HIRO),
-        Contender("TD3, noise 0.1", TD3, maze_td3(0.1)),
-        Contender("TD3, noise 0.5", TD3, maze_td3(0.5)),
-    ]
-    return lambda seed: make_vec_env(PointMazeEnv, 8, seed=seed), contenders
-
-
-def reach() -> tuple[Make, list[Contender]]:
-    """HIRO on PandaReach-v0."""
-    return lambda seed: make_fast_vec_env("PandaReach-v0", 8, seed=seed, n_targets=1), [Contender("HIRO", HIRO, REACH)]
-
-
-TASKS = {"cartpole": (cartpole, 50_000, 100), "maze": (maze, 40_000, 40), "reach": (reach, 40_000, 100)}
+TASKS = {
+    "cartpole": Task(
+        lambda n_envs, seed: make_vec_env("CartPole-v1", n_envs, seed=seed),
+        n_envs=1,
+        steps=50_000,
+        episodes=100,
+        contenders=[Contender("DiscreteSAC", DiscreteSAC, CARTPOLE_SAC), Contender("DQN", DQN, ZOO_DQN)],
+    ),
+    "maze": Task(
+        lambda n_envs, seed: make_vec_env(PointMazeEnv, n_envs, seed=seed),
+        n_envs=8,
+        steps=40_000,
+        episodes=50,
+        contenders=[Contender("HIRO", HIRO, MAZE_HIRO), maze_td3(0.1), maze_td3(0.5)],
+    ),
+    "reach": Task(
+        lambda n_envs, seed: make_fast_vec_env("PandaReach-v0", n_envs, seed=seed, n_targets=1),
+        n_envs=8,
+        steps=40_000,
+        episodes=50,
+        contenders=[Contender("HIRO", HIRO, REACH)],
+    ),
+}
 
 
 def evaluate(model: BaseAlgorithm, env: VecEnv, n_episodes: int) -> dict[str, float | None]:
@@ -140,18 +154,17 @@ def run_seed(task: str, contender: Contender, seed: int, folder: Path) -> dict[s
     :param seed: of training; episodes of evaluation have another
     :param folder: where rows are kept, so that an interrupted study goes on where it was
     """
-    build, steps, episodes = TASKS[task]
-    make, _ = build()
+    make, n_envs, steps, episodes, _ = TASKS[task]
     path = folder / f"{task}_{contender.name.lower().replace(', ', '_').replace(' ', '_')}_{seed}.json"
-    settings = f"{steps} {episodes} {contender.settings}"
+    settings = f"{n_envs} {steps} {episodes} {contender.settings}"
     if path.exists() and (kept := json.loads(path.read_text()))["settings"] == settings:
         row: dict[str, Any] = kept["row"]
         return row
     started = time.process_time()
-    model = contender.algorithm("MlpPolicy", make(seed), seed=seed, device="cpu", **contender.settings)
+    model = contender.algorithm("MlpPolicy", make(n_envs, seed), seed=seed, device="cpu", **contender.settings)
     model.learn(steps)
     seconds = round(time.process_time() - started, 1)
-    scores = evaluate(model, make(10_000 + seed), episodes)
+    scores = evaluate(model, make(EVALUATION_ENVS, EVALUATION_SEED + seed), episodes)
     row = {"task": task, "algorithm": contender.name, "seed": seed, "steps": model.num_timesteps}
     row = {**row, **scores, "train_seconds": seconds}
     folder.mkdir(parents=True, exist_ok=True)
@@ -162,7 +175,7 @@ def run_seed(task: str, contender: Contender, seed: int, folder: Path) -> dict[s
 def run(tasks: list[str], seeds: int, only: str, folder: Path) -> Iterator[dict[str, Any]]:
     """Yield the rows of all contenders whose name starts with ``only``."""
     for task in tasks:
-        for contender in TASKS[task][0]()[1]:
+        for contender in TASKS[task].contenders:
             if contender.name.startswith(only):
                 yield from (run_seed(task, contender, seed, folder) for seed in range(seeds))
 
