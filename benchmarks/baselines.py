@@ -27,7 +27,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
 from study import write_results
 
 from sb3_progpolicy import HIRO, DiscreteSAC, make_fast_vec_env
@@ -56,19 +56,19 @@ CARTPOLE_SAC: dict[str, Any] = {
     "batch_size": 64,
     "tau": 0.01,
     "learning_starts": 1_000,
-    "train_freq": 4,
     "gradient_steps": 2,
     "policy_kwargs": SMALL,
 }
-MAZE: dict[str, Any] = {"gradient_steps": 4, "batch_size": 128, "tau": 0.02, "policy_kwargs": SMALL}
+MAZE: dict[str, Any] = {"gradient_steps": 2, "batch_size": 64, "tau": 0.02, "policy_kwargs": SMALL}
 RANDOM_STEPS = 10_000
 HIRO_SETTINGS: dict[str, Any] = {**MAZE, "low_gamma": 0.9, "high_gradient_steps": 4, "reward_scale": 1.0}
 MAZE_HIRO: dict[str, Any] = {**HIRO_SETTINGS, "high_learning_starts": RANDOM_STEPS}
 REACH: dict[str, Any] = {
     **HIRO_SETTINGS,
     "goal_dims": [0, 1, 2],  # where the gripper is
-    "learning_starts": 2_000,
-    "high_learning_starts": 6_000,
+    "gradient_steps": 4,
+    "learning_starts": 1_000,
+    "high_learning_starts": 3_000,
 }
 
 EVALUATION_ENVS = 10
@@ -81,13 +81,13 @@ class Contender(NamedTuple):
     name: str
     algorithm: type[BaseAlgorithm]
     settings: dict[str, Any]
+    n_envs: int
 
 
 class Task(NamedTuple):
-    """Environments, given a number of them and a seed, and what is trained in how many of them and for how long."""
+    """Environments, given a number of them and a seed, steps of training, episodes of evaluation, and who trains."""
 
     make: Callable[[int, int], VecEnv]
-    n_envs: int
     steps: int
     episodes: int
     contenders: list[Contender]
@@ -100,30 +100,29 @@ def maze_td3(noise: float) -> Contender:
         "learning_starts": RANDOM_STEPS,
         "action_noise": NormalActionNoise(np.zeros(2), np.full(2, noise)),
     }
-    return Contender(f"TD3, noise {noise:g}", TD3, settings)
+    return Contender(f"TD3, noise {noise:g}", TD3, settings, 8)
 
 
 TASKS = {
     "cartpole": Task(
         lambda n_envs, seed: make_vec_env("CartPole-v1", n_envs, seed=seed),
-        n_envs=1,
         steps=50_000,
         episodes=100,
-        contenders=[Contender("DiscreteSAC", DiscreteSAC, CARTPOLE_SAC), Contender("DQN", DQN, ZOO_DQN)],
+        contenders=[Contender("DiscreteSAC", DiscreteSAC, CARTPOLE_SAC, 8), Contender("DQN", DQN, ZOO_DQN, 1)],
     ),
     "maze": Task(
         lambda n_envs, seed: make_vec_env(PointMazeEnv, n_envs, seed=seed),
-        n_envs=8,
         steps=40_000,
         episodes=50,
-        contenders=[Contender("HIRO", HIRO, MAZE_HIRO), maze_td3(0.1), maze_td3(0.5)],
+        contenders=[Contender("HIRO", HIRO, MAZE_HIRO, 8), maze_td3(0.5)],
     ),
     "reach": Task(
-        lambda n_envs, seed: make_fast_vec_env("PandaReach-v0", n_envs, seed=seed, n_targets=1),
-        n_envs=8,
-        steps=40_000,
+        lambda n_envs, seed: VecNormalize(
+            make_fast_vec_env("PandaReach-v0", n_envs, seed=seed, n_targets=1), norm_reward=False
+        ),
+        steps=20_000,
         episodes=50,
-        contenders=[Contender("HIRO", HIRO, REACH)],
+        contenders=[Contender("HIRO", HIRO, REACH, 8)],
     ),
 }
 
@@ -154,17 +153,23 @@ def run_seed(task: str, contender: Contender, seed: int, folder: Path) -> dict[s
     :param seed: of training; episodes of evaluation have another
     :param folder: where rows are kept, so that an interrupted study goes on where it was
     """
-    make, n_envs, steps, episodes, _ = TASKS[task]
+    make, steps, episodes, _ = TASKS[task]
     path = folder / f"{task}_{contender.name.lower().replace(', ', '_').replace(' ', '_')}_{seed}.json"
-    settings = f"{n_envs} {steps} {episodes} {contender.settings}"
+    settings = f"{contender.n_envs} {steps} {episodes} {contender.settings}"
     if path.exists() and (kept := json.loads(path.read_text()))["settings"] == settings:
         row: dict[str, Any] = kept["row"]
         return row
     started = time.process_time()
-    model = contender.algorithm("MlpPolicy", make(n_envs, seed), seed=seed, device="cpu", **contender.settings)
+    model = contender.algorithm(
+        "MlpPolicy", make(contender.n_envs, seed), seed=seed, device="cpu", **contender.settings
+    )
     model.learn(steps)
     seconds = round(time.process_time() - started, 1)
-    scores = evaluate(model, make(EVALUATION_ENVS, EVALUATION_SEED + seed), episodes)
+    evaluation_env = make(EVALUATION_ENVS, EVALUATION_SEED + seed)
+    if isinstance(evaluation_env, VecNormalize):
+        evaluation_env.training = False
+        sync_envs_normalization(model.get_env(), evaluation_env)
+    scores = evaluate(model, evaluation_env, episodes)
     row = {"task": task, "algorithm": contender.name, "seed": seed, "steps": model.num_timesteps}
     row = {**row, **scores, "train_seconds": seconds}
     folder.mkdir(parents=True, exist_ok=True)
