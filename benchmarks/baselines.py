@@ -27,7 +27,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from study import write_results
 
 from sb3_progpolicy import HIRO, DiscreteSAC, make_fast_vec_env
@@ -54,7 +54,8 @@ ZOO_DQN: dict[str, Any] = {
 CARTPOLE_SAC: dict[str, Any] = {
     "learning_rate": 1e-3,
     "batch_size": 64,
-    "tau": 0.01,
+    "tau": 0.02,
+    "target_entropy": "auto_0.2",
     "learning_starts": 1_000,
     "gradient_steps": 2,
     "policy_kwargs": SMALL,
@@ -66,7 +67,10 @@ MAZE_HIRO: dict[str, Any] = {**HIRO_SETTINGS, "high_learning_starts": RANDOM_STE
 REACH: dict[str, Any] = {
     **HIRO_SETTINGS,
     "goal_dims": [0, 1, 2],  # where the gripper is
+    "goal_period": 5,  # steps of 5 cm
+    "goal_scale": 1.0,
     "gradient_steps": 4,
+    "high_gradient_steps": 2,
     "learning_starts": 1_000,
     "high_learning_starts": 3_000,
 }
@@ -103,6 +107,14 @@ def maze_td3(noise: float) -> Contender:
     return Contender(f"TD3, noise {noise:g}", TD3, settings, 8)
 
 
+def make_reach(n_envs: int, seed: int) -> VecEnv:
+    """Return PandaReach-v0 with one target, 50 steps at most, and observations in units of 20 cm."""
+    env = make_fast_vec_env("PandaReach-v0", n_envs, seed=seed, n_targets=1, max_episode_steps=50)
+    scaled = VecNormalize(env, training=False, norm_reward=False)
+    scaled.obs_rms.var[:] = 0.2**2  # its mean stays 0
+    return scaled
+
+
 TASKS = {
     "cartpole": Task(
         lambda n_envs, seed: make_vec_env("CartPole-v1", n_envs, seed=seed),
@@ -117,9 +129,7 @@ TASKS = {
         contenders=[Contender("HIRO", HIRO, MAZE_HIRO, 8), maze_td3(0.5)],
     ),
     "reach": Task(
-        lambda n_envs, seed: VecNormalize(
-            make_fast_vec_env("PandaReach-v0", n_envs, seed=seed, n_targets=1), norm_reward=False
-        ),
+        make_reach,
         steps=20_000,
         episodes=50,
         contenders=[Contender("HIRO", HIRO, REACH, 8)],
@@ -165,11 +175,7 @@ def run_seed(task: str, contender: Contender, seed: int, folder: Path) -> dict[s
     )
     model.learn(steps)
     seconds = round(time.process_time() - started, 1)
-    evaluation_env = make(EVALUATION_ENVS, EVALUATION_SEED + seed)
-    if isinstance(evaluation_env, VecNormalize):
-        evaluation_env.training = False
-        sync_envs_normalization(model.get_env(), evaluation_env)
-    scores = evaluate(model, evaluation_env, episodes)
+    scores = evaluate(model, make(EVALUATION_ENVS, EVALUATION_SEED + seed), episodes)
     row = {"task": task, "algorithm": contender.name, "seed": seed, "steps": model.num_timesteps}
     row = {**row, **scores, "train_seconds": seconds}
     folder.mkdir(parents=True, exist_ok=True)
