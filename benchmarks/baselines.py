@@ -13,9 +13,10 @@ was.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -156,13 +157,16 @@ def evaluate(model: BaseAlgorithm, env: VecEnv, n_episodes: int) -> dict[str, fl
     }
 
 
-def run_seed(task: str, contender: Contender, seed: int, folder: Path) -> dict[str, Any]:
+def run_seed(
+    task: str, contender: Contender, seed: int, folder: Path, *, finished_only: bool = False
+) -> dict[str, Any] | None:
     """Return the row of one seed, trained now or read from ``folder``.
 
     :param task: one of ``TASKS``
     :param contender: that is trained
     :param seed: of training; episodes of evaluation have another
     :param folder: where rows are kept, so that an interrupted study goes on where it was
+    :param finished_only: whether nothing is trained; ``None`` is returned where there is no row
     """
     make, steps, episodes, _ = TASKS[task]
     path = folder / f"{task}_{contender.name.lower().replace(', ', '_').replace(' ', '_')}_{seed}.json"
@@ -170,6 +174,8 @@ def run_seed(task: str, contender: Contender, seed: int, folder: Path) -> dict[s
     if path.exists() and (kept := json.loads(path.read_text()))["settings"] == settings:
         row: dict[str, Any] = kept["row"]
         return row
+    if finished_only:
+        return None
     started = time.process_time()
     model = contender.algorithm(
         "MlpPolicy", make(contender.n_envs, seed), seed=seed, device="cpu", **contender.settings
@@ -184,14 +190,6 @@ def run_seed(task: str, contender: Contender, seed: int, folder: Path) -> dict[s
     return row
 
 
-def run(tasks: list[str], seeds: int, only: str, folder: Path) -> Iterator[dict[str, Any]]:
-    """Yield the rows of all contenders whose name starts with ``only``."""
-    for task in tasks:
-        for contender in TASKS[task].contenders:
-            if contender.name.startswith(only):
-                yield from (run_seed(task, contender, seed, folder) for seed in range(seeds))
-
-
 def main() -> None:
     """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -200,16 +198,22 @@ def main() -> None:
     )
     parser.add_argument("--seeds", type=int, default=3, help="number of seeds, from 0 on")
     parser.add_argument("--only", default="", help="contenders whose name starts so")
+    parser.add_argument("--finished", action="store_true", help="train nothing; write what is finished")
     parser.add_argument("--name", default="baselines", help="name of the result files")
     options = parser.parse_args()
     if unknown := set(options.tasks) - set(TASKS):
         parser.error(f"there is no task {', '.join(sorted(unknown))}; there are {', '.join(TASKS)}")
     th.set_num_threads(1)
-    rows = []
-    for row in run(options.tasks, options.seeds, options.only, Path("runs") / options.name):
-        rows.append(row)
-        print(*(f"{key}={value}" for key, value in row.items()), flush=True)
-        write_results(options.name, COLUMNS, rows, {})
+    rows: list[dict[str, Any]] = []
+    for task in options.tasks:
+        chosen = [contender for contender in TASKS[task].contenders if contender.name.startswith(options.only)]
+        for contender, seed in itertools.product(chosen, range(options.seeds)):
+            folder = Path("runs") / options.name
+            row = run_seed(task, contender, seed, folder, finished_only=options.finished)
+            if row is not None:
+                rows.append(row)
+                print(*(f"{key}={value}" for key, value in row.items()), flush=True)
+                write_results(options.name, COLUMNS, rows, {})
 
 
 if __name__ == "__main__":
