@@ -49,6 +49,7 @@ class HIRO(OffPolicyAlgorithm):
     probabilities are what the correction asks for; its exploration is its entropy.
 
     Arguments are those of SB3's ``TD3``, in the same order, less the choice of a replay buffer, and more about goals.
+    Behind ``VecNormalize``, fix its statistics before training (``env.training = False``): goals are in its units.
 
     :param policy: ``"MlpPolicy"`` or a class
     :param env: environment, vectorised environment or id, with observations that are vectors and ``Box`` or
