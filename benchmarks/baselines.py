@@ -1,20 +1,23 @@
 """What the baselines reach, next to Stable-Baselines3's nearest algorithm where there is one.
 
-    python benchmarks/baselines.py cartpole [--seeds 3] [--steps 50000]
-    python benchmarks/baselines.py maze [--seeds 3] [--steps 40000]
-    python benchmarks/baselines.py reach [--seeds 3] [--steps 40000]
+    python benchmarks/baselines.py [cartpole] [maze] [reach] [--seeds 3]
 
 ``cartpole`` compares DiscreteSAC with SB3's DQN, whose settings are rl-baselines3-zoo's, on CartPole-v1; ``maze``
 compares HIRO with SB3's TD3 on a U-shaped corridor with its only reward at the far end (``point_maze.py``), both with
 as many gradient steps, networks and random steps; ``reach`` trains HIRO on PandaReach-v0 with one target. Each seed is
-evaluated on episodes never trained on, with the most likely actions; seconds are of this process, on one thread.
+evaluated on episodes never trained on, with the most likely actions; seconds are of the processor, on one thread. All
+go to ``results/baselines.csv``. A finished seed is kept in ``runs/``, so that an interrupted study goes on where it
+was.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
+import json
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,9 +28,14 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from study import write_results
 
 from sb3_progpolicy import HIRO, DiscreteSAC, make_fast_vec_env
+from sb3_progpolicy.programs.files import write_atomically
+
+COLUMNS = ("task", "algorithm", "seed", "steps", "return", "length", "success", "train_seconds")
 
 SMALL: dict[str, Any] = {"net_arch": [64, 64], "optimizer_kwargs": {"fused": True}}
 
@@ -46,25 +54,31 @@ ZOO_DQN: dict[str, Any] = {
     "policy_kwargs": {"net_arch": [256, 256]},
 }
 CARTPOLE_SAC: dict[str, Any] = {
-    "learning_rate": 1e-3,
+    "learning_rate": LinearSchedule(1e-3, 1e-5, 1.0),
     "batch_size": 128,
+    "tau": 0.02,
+    "target_entropy": "auto_0.2",
     "learning_starts": 1_000,
-    "train_freq": 4,
     "gradient_steps": 4,
     "policy_kwargs": SMALL,
 }
-MAZE: dict[str, Any] = {"gradient_steps": 4, "batch_size": 128, "tau": 0.02, "policy_kwargs": SMALL}
+MAZE: dict[str, Any] = {"gradient_steps": 2, "batch_size": 64, "tau": 0.02, "policy_kwargs": SMALL}
 RANDOM_STEPS = 10_000
 HIRO_SETTINGS: dict[str, Any] = {**MAZE, "low_gamma": 0.9, "high_gradient_steps": 4, "reward_scale": 1.0}
 MAZE_HIRO: dict[str, Any] = {**HIRO_SETTINGS, "high_learning_starts": RANDOM_STEPS}
 REACH: dict[str, Any] = {
     **HIRO_SETTINGS,
-    "goal_dims": [26, 27, 28],  # where the hand is
-    "learning_starts": 2_000,
-    "high_learning_starts": 6_000,
+    "goal_dims": [0, 1, 2],  # where the gripper is
+    "goal_period": 5,  # steps of 5 cm
+    "goal_scale": 1.0,
+    "gradient_steps": 4,
+    "high_gradient_steps": 2,
+    "learning_starts": 1_000,
+    "high_learning_starts": 3_000,
 }
 
-Make = Callable[[int], VecEnv]
+EVALUATION_ENVS = 10
+EVALUATION_SEED = 10_000
 
 
 class Contender(NamedTuple):
@@ -73,43 +87,60 @@ class Contender(NamedTuple):
     name: str
     algorithm: type[BaseAlgorithm]
     settings: dict[str, Any]
+    n_envs: int
 
 
-def maze_td3(noise: float) -> dict[str, Any]:
-    """Return settings of TD3 with some exploration noise."""
-    return {
+class Task(NamedTuple):
+    """Environments, given a number of them and a seed, steps of training, episodes of evaluation, and who trains."""
+
+    make: Callable[[int, int], VecEnv]
+    steps: int
+    episodes: int
+    contenders: list[Contender]
+
+
+def maze_td3(noise: float) -> Contender:
+    """Return TD3 with some exploration noise."""
+    settings = {
         **MAZE,
         "learning_starts": RANDOM_STEPS,
         "action_noise": NormalActionNoise(np.zeros(2), np.full(2, noise)),
     }
+    return Contender(f"TD3, noise {noise:g}", TD3, settings, 8)
 
 
-def cartpole() -> tuple[Make, list[Contender]]:
-    """DiscreteSAC and DQN on CartPole-v1."""
-    contenders = [Contender("DiscreteSAC", DiscreteSAC, CARTPOLE_SAC), Contender("DQN", DQN, ZOO_DQN)]
-    return lambda seed: make_vec_env("CartPole-v1", 1, seed=seed), contenders
+def make_reach(n_envs: int, seed: int) -> VecEnv:
+    """Return PandaReach-v0 with one target, 50 steps at most, and observations in units of 20 cm."""
+    env = make_fast_vec_env("PandaReach-v0", n_envs, seed=seed, n_targets=1, max_episode_steps=50)
+    scaled = VecNormalize(env, training=False, norm_reward=False)
+    scaled.obs_rms.var[:] = 0.2**2  # its mean stays 0
+    return scaled
 
 
-def maze() -> tuple[Make, list[Contender]]:
-    """HIRO and TD3 in the corridor."""
-    contenders = [
-        Contender("HIRO", HIRO, MAZE_HIRO),
-        Contender("TD3, noise 0.1", TD3, maze_td3(0.1)),
-        Contender("TD3, noise 0.5", TD3, maze_td3(0.5)),
-    ]
-    return lambda seed: make_vec_env(PointMazeEnv, 8, seed=seed), contenders
+TASKS = {
+    "cartpole": Task(
+        lambda n_envs, seed: make_vec_env("CartPole-v1", n_envs, seed=seed),
+        steps=50_000,
+        episodes=100,
+        contenders=[Contender("DiscreteSAC", DiscreteSAC, CARTPOLE_SAC, 8), Contender("DQN", DQN, ZOO_DQN, 1)],
+    ),
+    "maze": Task(
+        lambda n_envs, seed: make_vec_env(PointMazeEnv, n_envs, seed=seed),
+        steps=40_000,
+        episodes=50,
+        contenders=[Contender("HIRO", HIRO, MAZE_HIRO, 8), maze_td3(0.5)],
+    ),
+    "reach": Task(
+        make_reach,
+        steps=20_000,
+        episodes=50,
+        contenders=[Contender("HIRO", HIRO, REACH, 8)],
+    ),
+}
 
 
-def reach() -> tuple[Make, list[Contender]]:
-    """HIRO on PandaReach-v0."""
-    return lambda seed: make_fast_vec_env("PandaReach-v0", 8, seed=seed, n_targets=1), [Contender("HIRO", HIRO, REACH)]
-
-
-TASKS = {"cartpole": (cartpole, 50_000, 100), "maze": (maze, 40_000, 40), "reach": (reach, 40_000, 40)}
-
-
-def evaluate(model: BaseAlgorithm, env: VecEnv, n_episodes: int) -> tuple[float, float, float]:
-    """Return mean return, mean length and share of successes, NaN where the environment reports none."""
+def evaluate(model: BaseAlgorithm, env: VecEnv, n_episodes: int) -> dict[str, float | None]:
+    """Return mean return, mean length and share of successes, the last ``None`` where the environment reports none."""
     successes: list[bool] = []
 
     def note(local: dict[str, Any], _: dict[str, Any]) -> None:
@@ -119,34 +150,70 @@ def evaluate(model: BaseAlgorithm, env: VecEnv, n_episodes: int) -> tuple[float,
     returns, lengths = evaluate_policy(
         model, env, n_episodes, deterministic=True, callback=note, return_episode_rewards=True, warn=False
     )
-    return float(np.mean(returns)), float(np.mean(lengths)), float(np.mean(successes)) if successes else float("nan")
+    return {
+        "return": round(float(np.mean(returns)), 2),
+        "length": round(float(np.mean(lengths)), 1),
+        "success": round(float(np.mean(successes)), 3) if successes else None,
+    }
+
+
+def run_seed(
+    task: str, contender: Contender, seed: int, folder: Path, *, finished_only: bool = False
+) -> dict[str, Any] | None:
+    """Return the row of one seed, trained now or read from ``folder``.
+
+    :param task: one of ``TASKS``
+    :param contender: that is trained
+    :param seed: of training; episodes of evaluation have another
+    :param folder: where rows are kept, so that an interrupted study goes on where it was
+    :param finished_only: whether nothing is trained; ``None`` is returned where there is no row
+    """
+    make, steps, episodes, _ = TASKS[task]
+    path = folder / f"{task}_{contender.name.lower().replace(', ', '_').replace(' ', '_')}_{seed}.json"
+    settings = f"{contender.n_envs} {steps} {episodes} {contender.settings}"
+    if path.exists() and (kept := json.loads(path.read_text()))["settings"] == settings:
+        row: dict[str, Any] = kept["row"]
+        return row
+    if finished_only:
+        return None
+    started = time.process_time()
+    model = contender.algorithm(
+        "MlpPolicy", make(contender.n_envs, seed), seed=seed, device="cpu", **contender.settings
+    )
+    model.learn(steps)
+    seconds = round(time.process_time() - started, 1)
+    scores = evaluate(model, make(EVALUATION_ENVS, EVALUATION_SEED + seed), episodes)
+    row = {"task": task, "algorithm": contender.name, "seed": seed, "steps": model.num_timesteps}
+    row = {**row, **scores, "train_seconds": seconds}
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, json.dumps({"settings": settings, "row": row}))
+    return row
 
 
 def main() -> None:
-    """Train and evaluate every contender with every seed."""
+    """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("task", choices=TASKS)
+    parser.add_argument(
+        "tasks", nargs="*", default=list(TASKS), metavar="task", help=f"of {', '.join(TASKS)}; all by default"
+    )
     parser.add_argument("--seeds", type=int, default=3, help="number of seeds, from 0 on")
-    parser.add_argument("--steps", type=int, help="environment steps of training; by default what the task needs")
-    parser.add_argument("--episodes", type=int, help="episodes of evaluation")
-    parser.add_argument("--only", help="contenders whose name starts so")
-    parser.add_argument("--progress", action="store_true", help="show a progress bar of each training")
-    arguments = parser.parse_args()
+    parser.add_argument("--only", default="", help="contenders whose name starts so")
+    parser.add_argument("--finished", action="store_true", help="train nothing; write what is finished")
+    parser.add_argument("--name", default="baselines", help="name of the result files")
+    options = parser.parse_args()
+    if unknown := set(options.tasks) - set(TASKS):
+        parser.error(f"there is no task {', '.join(sorted(unknown))}; there are {', '.join(TASKS)}")
     th.set_num_threads(1)
-    build, steps, episodes = TASKS[arguments.task]
-    make, contenders = build()
-    print("| algorithm | seed | steps | return | length | success | seconds |", "|---" * 7 + "|", sep="\n", flush=True)
-    for contender in contenders:
-        if arguments.only and not contender.name.startswith(arguments.only):
-            continue
-        for seed in range(arguments.seeds):
-            started = time.process_time()
-            model = contender.algorithm("MlpPolicy", make(seed), seed=seed, device="cpu", **contender.settings)
-            model.learn(arguments.steps or steps, progress_bar=arguments.progress)
-            seconds = time.process_time() - started
-            scores = evaluate(model, make(10_000 + seed), arguments.episodes or episodes)
-            cells = [contender.name, seed, model.num_timesteps, *(f"{score:.2f}" for score in scores), f"{seconds:.0f}"]
-            print("| " + " | ".join(map(str, cells)) + " |", flush=True)
+    rows: list[dict[str, Any]] = []
+    for task in options.tasks:
+        chosen = [contender for contender in TASKS[task].contenders if contender.name.startswith(options.only)]
+        for contender, seed in itertools.product(chosen, range(options.seeds)):
+            folder = Path("runs") / options.name
+            row = run_seed(task, contender, seed, folder, finished_only=options.finished)
+            if row is not None:
+                rows.append(row)
+                print(*(f"{key}={value}" for key, value in row.items()), flush=True)
+                write_results(options.name, COLUMNS, rows, {})
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""What a gradient step is made from."""
+"""What a gradient step is made from, and the step of one optimizer."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch as th
@@ -25,3 +26,21 @@ class Batch(NamedTuple):
     next_observations: PyTorchObs
     dones: th.Tensor
     discounts: th.Tensor | float
+
+
+CheckLoss = Callable[[th.Tensor], None]  # raises FloatingPointError for a loss that is not finite
+
+
+def minimize(loss: th.Tensor, optimizer: th.optim.Optimizer, check: CheckLoss) -> th.Tensor:
+    """Make one step of an optimizer, unless the loss is not finite, and return the loss without gradient.
+
+    :param loss: scalar
+    :param optimizer: of the parameters that the loss is of
+    :param check: called with the loss before any parameter changes
+    """
+    detached = loss.detach()
+    check(detached)
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+    return detached

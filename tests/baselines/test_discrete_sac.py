@@ -35,6 +35,24 @@ class Bandit(gym.Env):
         return np.eye(3, dtype=np.float32)[self.right], self.reward * won, True, False, {}
 
 
+class Corridor(gym.Env):
+    """Six places in a row; the last pays 1 and ends the episode. Truncated after 30 steps."""
+
+    observation_space = spaces.Box(0, 1, (6,), np.float32)
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place, self.steps = 0, 0
+        return np.eye(6, dtype=np.float32)[0], {}
+
+    def step(self, action):
+        self.place = max(0, self.place + (1 if action else -1))
+        self.steps += 1
+        there = self.place == 5
+        return np.eye(6, dtype=np.float32)[self.place], float(there), there, not there and self.steps == 30, {}
+
+
 class Records(Logger):
     """A logger that keeps what it is given."""
 
@@ -70,7 +88,7 @@ def test_policy_loss_leaves_the_critics_alone():
 
 def test_learns_a_bandit_whose_actions_do_not_start_at_zero():
     model = DiscreteSAC("MlpPolicy", make_vec_env(Bandit, 4, seed=0), **{**SMALL, "learning_rate": 1e-2})
-    model.learn(1200)
+    model.learn(480)
     assert evaluate_policy(model, make_vec_env(Bandit, 1, seed=1), 30, deterministic=True)[0] == 1
     drawn = model.predict(np.eye(3, dtype=np.float32)[np.zeros(500, dtype=int)], deterministic=False)[0]
     assert drawn.min() >= 5
@@ -78,6 +96,14 @@ def test_learns_a_bandit_whose_actions_do_not_start_at_zero():
     assert len(set(drawn)) > 1
 
 
+def test_learns_what_pays_only_later():
+    settings = {**SMALL, "learning_rate": 1e-2, "ent_coef": 0.02, "gamma": 0.9, "tau": 0.05}
+    model = DiscreteSAC("MlpPolicy", make_vec_env(Corridor, 4, seed=0), **settings).learn(800)
+    _, lengths = evaluate_policy(model, make_vec_env(Corridor, 1, seed=1), 1, return_episode_rewards=True)
+    assert lengths == [5]
+
+
+@pytest.mark.slow
 def test_learns_to_balance_a_pole():
     model = DiscreteSAC(
         "MlpPolicy",
@@ -155,6 +181,8 @@ def test_images_and_dictionaries_have_policies():
     ("arguments", "message"),
     [
         ({"ent_coef": "automatic"}, "ent_coef='automatic' is not accepted; it is a number"),
+        ({"ent_coef": "auto_"}, "ent_coef='auto_' is not accepted"),
+        ({"n_steps": 0}, "n_steps=0 is not accepted; it is at least 1"),
         ({"ent_coef": "auto_-1"}, "ent_coef='auto_-1' is not accepted"),
         ({"ent_coef": -1.0}, "ent_coef=-1.0 is not accepted; it is at least 0"),
         ({"target_entropy": 0.7}, "target_entropy=0.7 is not accepted; it is at least 0 and at most 0.693147"),
@@ -178,6 +206,13 @@ def test_training_stops_at_a_reward_that_is_not_finite():
     model = DiscreteSAC("MlpPolicy", make_vec_env(lambda: Bandit(reward=np.nan), 2, seed=0), **SMALL)
     with pytest.raises(FloatingPointError, match=r"reward of environment \d is not finite"):
         model.learn(50)
+
+
+def test_loss_that_is_not_finite_does_not_reach_the_parameters():
+    model = DiscreteSAC("MlpPolicy", make_vec_env(lambda: Bandit(reward=1e25), 2, seed=0), **SMALL)
+    with pytest.raises(FloatingPointError, match="the loss is not finite"):
+        model.learn(50)  # the square of the reward is too large for a float
+    assert all(bool(th.isfinite(parameter).all()) for parameter in model.policy.parameters())
 
 
 def test_no_action_follows_from_an_observation_that_is_not_finite():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -44,9 +45,9 @@ def fraction_after(prefix: str, name: str, value: str | float, default: float) -
     """
     if not isinstance(value, str):
         return None
-    head, _, number = value.partition("_")
+    head, separator, number = value.partition("_")
     try:
-        parsed = float(number) if number else default
+        parsed = float(number) if separator else default
     except ValueError:
         parsed = math.nan
     if head != prefix or not 0 < parsed < math.inf:
@@ -134,6 +135,7 @@ class DiscreteSAC(OffPolicyAlgorithm):
     ) -> None:
         check_off_policy(locals())
         check_range("target_update_interval", target_update_interval, 1)
+        check_range("n_steps", n_steps, 1)
         if fraction_after("auto", "ent_coef", ent_coef, 1.0) is None:
             check_range("ent_coef", float(ent_coef), 0)
         super().__init__(
@@ -217,13 +219,13 @@ class DiscreteSAC(OffPolicyAlgorithm):
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
 
+        check = partial(check_update, timesteps=self.num_timesteps, advice=ADVICE)
         history: list[Losses] = []
         ent_coefs: list[float] = []
         ent_coef_losses: list[float] = []
         for step in range(gradient_steps):
             ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()
-            losses = gradient_step(self.policy, self._sample(batch_size), ent_coef)
-            check_update(losses.critic + losses.actor, self.num_timesteps, ADVICE)
+            losses = gradient_step(self.policy, self._sample(batch_size), ent_coef, check)
             history.append(losses)
             ent_coefs.append(ent_coef.item())
             if self.log_ent_coef is not None:

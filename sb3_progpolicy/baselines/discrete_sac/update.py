@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch as th
 from torch.nn import functional as F
 
-from sb3_progpolicy.baselines.batch import Batch
+from sb3_progpolicy.baselines.batch import Batch, CheckLoss, minimize
 from sb3_progpolicy.baselines.discrete_sac.policies import DiscreteSACPolicy
 
 TARGET_ENTROPY_FRACTION = 0.5  # of log(n_actions), unless another is given
@@ -53,12 +53,13 @@ def mean_entropy(log_probs: th.Tensor) -> th.Tensor:
     return -(log_probs.exp() * log_probs).sum(dim=1).mean()
 
 
-def gradient_step(policy: DiscreteSACPolicy, batch: Batch, ent_coef: th.Tensor) -> Losses:
+def gradient_step(policy: DiscreteSACPolicy, batch: Batch, ent_coef: th.Tensor, check: CheckLoss) -> Losses:
     """Make one step of the critics and one of the actor, both from the same Q-values.
 
     :param policy: whose networks and optimizers are used; its target networks are left alone
     :param batch: of transitions
     :param ent_coef: entropy coefficient, without gradient
+    :param check: called with each loss before it reaches a parameter
     """
     with th.no_grad():
         next_q = th.stack(policy.critic_target(batch.next_observations)).amin(dim=0)
@@ -68,13 +69,9 @@ def gradient_step(policy: DiscreteSACPolicy, batch: Batch, ent_coef: th.Tensor) 
     q_values = policy.critic(batch.observations)
     actions = batch.actions.long()
     critic_loss = 0.5 * th.stack([F.mse_loss(q.gather(1, actions), target) for q in q_values]).sum()
-    policy.critic.optimizer.zero_grad()
-    critic_loss.backward()
-    policy.critic.optimizer.step()
+    critic_loss = minimize(critic_loss, policy.critic.optimizer, check)
 
     log_probs = policy.actor.log_probs(batch.observations)
     actor_loss = policy_loss(log_probs, th.stack(q_values).detach().amin(dim=0), ent_coef)
-    policy.actor.optimizer.zero_grad()
-    actor_loss.backward()
-    policy.actor.optimizer.step()
-    return Losses(critic_loss.detach(), actor_loss.detach(), mean_entropy(log_probs.detach()))
+    actor_loss = minimize(actor_loss, policy.actor.optimizer, check)
+    return Losses(critic_loss, actor_loss, mean_entropy(log_probs.detach()))

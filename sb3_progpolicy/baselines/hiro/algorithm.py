@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -18,6 +19,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import safe_mean
 
 from sb3_progpolicy.baselines.arguments import check_action_space, check_off_policy, check_range
+from sb3_progpolicy.baselines.batch import CheckLoss
 from sb3_progpolicy.baselines.hiro import td3
 from sb3_progpolicy.baselines.hiro.buffer import GoalReplayBuffer
 from sb3_progpolicy.baselines.hiro.learning import EntropyCoefficient, high_batch, low_batch, low_step, measured_scale
@@ -49,6 +51,7 @@ class HIRO(OffPolicyAlgorithm):
     probabilities are what the correction asks for; its exploration is its entropy.
 
     Arguments are those of SB3's ``TD3``, in the same order, less the choice of a replay buffer, and more about goals.
+    Behind ``VecNormalize``, fix its statistics before training (``env.training = False``): goals are in its units.
 
     :param policy: ``"MlpPolicy"`` or a class
     :param env: environment, vectorised environment or id, with observations that are vectors and ``Box`` or
@@ -164,7 +167,6 @@ class HIRO(OffPolicyAlgorithm):
         self.target_noise_clip = target_noise_clip
         self.ent_coef: EntropyCoefficient | None = None
         self._goal_state: GoalState | None = None
-        self._scale_is_known = False
         if _init_setup_model:
             self._setup_model()
 
@@ -173,11 +175,15 @@ class HIRO(OffPolicyAlgorithm):
         dims = self._checked_dims()
         scale = self._checked_scale(len(dims))
         self.replay_buffer_kwargs = {"n_goal_dims": len(dims), "goal_period": self.goal_period}
-        self.policy_kwargs = {**self.policy_kwargs, "goal_dims": dims, "goal_period": self.goal_period}
+        given = self.policy_kwargs
+        if misplaced := {"goal_dims", "goal_period"} & set(given):
+            raise ValueError(f"policy_kwargs has {sorted(misplaced)}; give them as arguments of HIRO")
+        # Kept apart, so that the policy_kwargs of a saved model are those given, which SB3 compares in loading.
+        self.policy_kwargs = {**given, "goal_dims": dims, "goal_period": self.goal_period}
         super()._setup_model()
+        self.policy_kwargs = given
         if scale is not None:
             self.policy.goal_scale.copy_(scale)
-            self._scale_is_known = True
         if isinstance(self.action_space, spaces.Discrete):
             self.ent_coef = EntropyCoefficient(int(self.action_space.n), self.lr_schedule(1)).to(self.device)
         elif self.action_noise is None:
@@ -202,17 +208,24 @@ class HIRO(OffPolicyAlgorithm):
         history = 0
         if self.env is not None and appends_history(self.env):
             history = action_spec(self.action_space).interaction_size
-        dims = list(range(size - history)) if self.goal_dims is None else [int(dim) for dim in self.goal_dims]
-        if not dims or len(set(dims)) < len(dims) or not all(0 <= dim < size for dim in dims):
+        dims = list(range(size - history)) if self.goal_dims is None else list(self.goal_dims)
+        whole = all(isinstance(dim, (int, np.integer)) and 0 <= dim < size for dim in dims)
+        if not dims or not whole or len(set(dims)) < len(dims):
             raise ValueError(
                 f"goal_dims={self.goal_dims!r} is not accepted; it has one or more different indices of the "
                 f"observation, from 0 to {size - 1}"
             )
-        return dims
+        return [int(dim) for dim in dims]
 
     def _checked_scale(self, n_dims: int) -> th.Tensor | None:
         """Return the scale given, ``(n_dims,)``, or ``None`` for ``"auto"``."""
         if isinstance(self.goal_scale, str) and self.goal_scale == "auto":
+            if self.learning_starts < self.goal_period * self.n_envs:
+                raise ValueError(
+                    f"learning_starts={self.learning_starts} is too few to measure goal_scale='auto' on: a segment of "
+                    f"{self.n_envs} environments is {self.goal_period * self.n_envs} steps. Raise it or give a "
+                    "goal_scale"
+                )
             return None
         scale: NDArray[Any]
         try:
@@ -293,17 +306,22 @@ class HIRO(OffPolicyAlgorithm):
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self._optimizers())
-        if not self._scale_is_known:
-            self._measure_scale()
+        if not (self._scale_is_known or self._measure_scale()):
+            return
+        check = partial(check_update, timesteps=self.num_timesteps, advice=ADVICE)
         logs: dict[str, list[float]] = {}
         for _ in range(gradient_steps):
             self._n_updates += 1
-            self._train_low(batch_size, logs)
+            self._train_low(batch_size, check, logs)
             for _ in range(0 if self._n_updates % self.goal_period else self.high_gradient_steps):
-                self._train_high(batch_size, logs)
+                self._train_high(batch_size, check, logs)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for key, values in logs.items():
             self.logger.record(f"train/{key}", safe_mean(values))
+
+    @property
+    def _scale_is_known(self) -> bool:
+        return bool((self.policy.goal_scale > 0).any())
 
     @property
     def _td3_settings(self) -> td3.TD3Settings:
@@ -314,12 +332,12 @@ class HIRO(OffPolicyAlgorithm):
         optimizers = [network.optimizer for level in levels for network in (level.actor, level.critic)]
         return optimizers if self.ent_coef is None else [*optimizers, self.ent_coef.optimizer]
 
-    def _measure_scale(self) -> None:
-        """Set the scale of goals once, from the segments so far; those of random goals did not depend on it."""
+    def _measure_scale(self) -> bool:
+        """Set the scale of goals once, from the segments so far, if any; those of random goals did not depend on it."""
         assert self.replay_buffer is not None
         segments = self.replay_buffer.sample_segments(SCALE_SEGMENTS, self._vec_normalize_env)
         if segments is None:
-            return
+            return False
         scale = measured_scale(self.policy, segments)
         if not bool((scale > 0).any()):
             raise ValueError(
@@ -327,19 +345,19 @@ class HIRO(OffPolicyAlgorithm):
                 f"{self.num_timesteps} steps; give a goal_scale, other goal_dims or more learning_starts"
             )
         self.policy.goal_scale.copy_(scale)
-        self._scale_is_known = True
+        return True
 
-    def _train_low(self, batch_size: int, logs: dict[str, list[float]]) -> None:
+    def _train_low(self, batch_size: int, check: CheckLoss, logs: dict[str, list[float]]) -> None:
         assert self.replay_buffer is not None
         steps = self.replay_buffer.sample_steps(batch_size, self._vec_normalize_env)
         batch = low_batch(self.policy, steps, self.low_gamma)
-        losses = low_step(self.policy, batch, self._td3_settings, self._n_updates, self.ent_coef)
+        losses = low_step(self.policy, batch, self._td3_settings, self._n_updates, self.ent_coef, check)
         logs.setdefault("intrinsic_reward", []).append(batch.rewards.mean().item())
         if self.ent_coef is not None:
             logs.setdefault("ent_coef", []).append(self.ent_coef.value().item())
         self._note_losses("low", losses, logs)
 
-    def _train_high(self, batch_size: int, logs: dict[str, list[float]]) -> None:
+    def _train_high(self, batch_size: int, check: CheckLoss, logs: dict[str, list[float]]) -> None:
         assert self.replay_buffer is not None
         segments = self.replay_buffer.sample_segments(batch_size, self._vec_normalize_env)
         if segments is None:
@@ -348,7 +366,7 @@ class HIRO(OffPolicyAlgorithm):
         relabelled = (batch.actions != segments.goals).any(dim=1).float().mean()
         logs.setdefault("relabelled", []).append(relabelled.item())
         self._n_high_updates += 1
-        losses = td3.gradient_step(self.policy.high, batch, self._td3_settings, self._n_high_updates)
+        losses = td3.gradient_step(self.policy.high, batch, self._td3_settings, self._n_high_updates, check)
         self._note_losses("high", losses, logs)
 
     def _note_losses(
@@ -356,7 +374,6 @@ class HIRO(OffPolicyAlgorithm):
     ) -> None:
         for name, loss in zip(("critic_loss", "actor_loss"), losses, strict=True):
             if loss is not None:
-                check_update(loss, self.num_timesteps, ADVICE)
                 logs.setdefault(f"{level}_{name}", []).append(loss.item())
 
     def learn(

@@ -8,7 +8,7 @@ import torch as th
 from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.td3.policies import TD3Policy
 
-from sb3_progpolicy.baselines.batch import Batch
+from sb3_progpolicy.baselines.batch import Batch, CheckLoss
 from sb3_progpolicy.baselines.discrete_sac import update as discrete_sac
 from sb3_progpolicy.baselines.hiro import td3
 from sb3_progpolicy.baselines.hiro.buffer import Segments, Steps
@@ -116,6 +116,7 @@ def low_step(
     settings: td3.TD3Settings,
     n_updates: int,
     coefficient: EntropyCoefficient | None,
+    check: CheckLoss,
 ) -> tuple[th.Tensor, th.Tensor | None]:
     """Make a gradient step of the low level, by TD3 or discrete soft actor-critic.
 
@@ -124,14 +125,15 @@ def low_step(
     :param settings: of TD3
     :param n_updates: number of this step, from 1 on
     :param coefficient: of a discrete low level
+    :param check: called with each loss before it reaches a parameter
     :return: the losses of critics and actor, the latter ``None`` where it was left alone
     """
     low = policy.low
     if isinstance(low, TD3Policy):
-        return td3.gradient_step(low, batch, settings, n_updates)
+        return td3.gradient_step(low, batch, settings, n_updates, check)
     assert coefficient is not None
     indices = batch.actions - int(low.action_space.start)
-    losses = discrete_sac.gradient_step(low, batch._replace(actions=indices), coefficient.value())
+    losses = discrete_sac.gradient_step(low, batch._replace(actions=indices), coefficient.value(), check)
     coefficient.step(losses.entropy)
     polyak_update(low.critic.parameters(), low.critic_target.parameters(), settings.tau)
     return losses.critic, losses.actor

@@ -78,7 +78,7 @@ class HIROPolicy(BasePolicy):
         assert observation_space.shape is not None
         self.goal_period = goal_period
         self.register_buffer("goal_dims", th.tensor(goal_dims, dtype=th.long))
-        self.register_buffer("goal_scale", th.ones(len(goal_dims)))
+        self.register_buffer("goal_scale", th.zeros(len(goal_dims)))  # until it is given or measured
         self.networks: dict[str, Any] = {
             "net_arch": [300, 300] if net_arch is None else net_arch,
             "activation_fn": activation_fn,

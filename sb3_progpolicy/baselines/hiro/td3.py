@@ -9,7 +9,7 @@ from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.td3.policies import TD3Policy
 from torch.nn import functional as F
 
-from sb3_progpolicy.baselines.batch import Batch
+from sb3_progpolicy.baselines.batch import Batch, CheckLoss, minimize
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def critic_target(policy: TD3Policy, batch: Batch, settings: TD3Settings) -> th.
 
 
 def gradient_step(
-    policy: TD3Policy, batch: Batch, settings: TD3Settings, n_updates: int
+    policy: TD3Policy, batch: Batch, settings: TD3Settings, n_updates: int, check: CheckLoss
 ) -> tuple[th.Tensor, th.Tensor | None]:
     """Make one step of the critics and, every ``policy_delay`` steps, one of the actor and the targets.
 
@@ -48,23 +48,20 @@ def gradient_step(
     :param batch: of transitions
     :param settings: of TD3
     :param n_updates: number of this step, from 1 on
+    :param check: called with each loss before it reaches a parameter
     :return: the losses of critics and actor, the latter ``None`` where it was left alone; without gradient
     """
     target = critic_target(policy, batch, settings)
     q_values = policy.critic(batch.observations, batch.actions)
-    critic_loss = th.stack([F.mse_loss(q, target) for q in q_values]).sum()
-    policy.critic.optimizer.zero_grad()
-    critic_loss.backward()
-    policy.critic.optimizer.step()
+    loss = th.stack([F.mse_loss(q, target) for q in q_values]).sum()
+    critic_loss = minimize(loss, policy.critic.optimizer, check)
     if n_updates % settings.policy_delay:
-        return critic_loss.detach(), None
+        return critic_loss, None
 
     observations = batch.observations
     assert isinstance(observations, th.Tensor)
-    actor_loss = -policy.critic.q1_forward(observations, policy.actor(observations)).mean()
-    policy.actor.optimizer.zero_grad()
-    actor_loss.backward()
-    policy.actor.optimizer.step()
+    loss = -policy.critic.q1_forward(observations, policy.actor(observations)).mean()
+    actor_loss = minimize(loss, policy.actor.optimizer, check)
     polyak_update(policy.critic.parameters(), policy.critic_target.parameters(), settings.tau)
     polyak_update(policy.actor.parameters(), policy.actor_target.parameters(), settings.tau)
-    return critic_loss.detach(), actor_loss.detach()
+    return critic_loss, actor_loss
