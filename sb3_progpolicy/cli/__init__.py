@@ -1,4 +1,4 @@
-"""The command line: train, evaluate, show, render, play, envs. Each command imports what it needs when it runs."""
+"""The command line: a module for each command, which imports what it needs when it runs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sb3_progpolicy.cli import envs, evaluate, play, render, show, train
+from sb3_progpolicy.cli import envs, evaluate, plan, play, render, show, train
 from sb3_progpolicy.cli.parsing import repeat_flags
 from sb3_progpolicy.nearest import unknown
 
@@ -29,6 +29,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "show": show.show,
     "render": render.render,
     "play": play.play,
+    "plan": plan.plan,
     "envs": envs.envs,
 }
 
