@@ -7,6 +7,7 @@ import progpolicy_envs  # registers the environments
 
 if TYPE_CHECKING:
     from sb3_progpolicy.baselines import HIRO, DiscreteSAC
+    from sb3_progpolicy.callbacks import InteractionEvalCallback
     from sb3_progpolicy.evaluation import Evaluation, evaluate_model, evaluate_program
     from sb3_progpolicy.extraction import extract_program, holds_program
     from sb3_progpolicy.interaction import InteractionHistory, VecInteractionHistory
@@ -26,6 +27,7 @@ _MODULES = {
     "Evaluation": "evaluation",
     "GroupedSubprocVecEnv": "vec_env",
     "GroupedVecEnv": "vec_env",
+    "InteractionEvalCallback": "callbacks",
     "InteractionHistory": "interaction",
     "ProgrammaticPolicy": "policies",
     "RecurrentProgrammaticPolicy": "policies",
@@ -52,6 +54,7 @@ __all__ = [
     "Evaluation",
     "GroupedSubprocVecEnv",
     "GroupedVecEnv",
+    "InteractionEvalCallback",
     "InteractionHistory",
     "ProgrammaticPolicy",
     "RecurrentProgrammaticPolicy",

@@ -129,6 +129,15 @@ def test_first_epoch_starts_at_the_log_probabilities_of_the_rollout(policy, poli
         assert values.abs().max() < 1e-4
 
 
+@pytest.mark.filterwarnings("ignore:You have specified a mini-batch")
+def test_where_the_batch_size_does_not_divide_the_rollout_sequences_are_shorter_and_a_warning_says_so():
+    with pytest.warns(UserWarning, match="n_steps=16: gradient steps are made on 1 sequences of 8 steps"):
+        model = make(batch_size=12, n_epochs=1)
+    ratios = [ratio for ratio, _ in log_ratios(model)]
+    assert {len(ratio) for ratio in ratios} == {8}
+    assert max(ratio.abs().max() for ratio in ratios) < 1e-5
+
+
 @pytest.mark.parametrize("cell", ["gru", "lstm", "rnn"])
 def test_rollout_of_the_sampler_is_that_of_the_policy_stepped_by_hand(cell):
     model = make(policy_kwargs={"cell": cell}, inner_updates=1, n_epochs=1, learning_rate=0.0)
@@ -382,11 +391,6 @@ def test_tasks_are_given_as_mapping_or_list(tasks):
         ({"search_fraction": 1.5}, "search_fraction=1.5"),
         ({"length_coef": -1.0}, "length_coef=-1.0"),
         ({"n_envs": 0}, "n_envs=0"),
-        pytest.param(
-            {"batch_size": 12},
-            "batch_size=12",
-            marks=pytest.mark.filterwarnings("ignore:You have specified a mini-batch"),
-        ),
         ({"tasks": []}, "at least one variation"),
         ({"inner_updates": 0}, "inner_updates=0"),
         ({"meta_optimizer": "lion"}, "known: sgd, adam"),

@@ -1,4 +1,4 @@
-"""The command line. Each command imports what it needs when it runs."""
+"""The command line: a module for each command, which imports what it needs when it runs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sb3_progpolicy.cli import benchmark, envs, evaluate, play, render, show, train, tune
+from sb3_progpolicy.cli import benchmark, envs, evaluate, plan, play, render, show, train, tune
 from sb3_progpolicy.cli.parsing import repeat_flags
 from sb3_progpolicy.nearest import unknown
 
@@ -30,6 +30,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "show": show.show,
     "render": render.render,
     "play": play.play,
+    "plan": plan.plan,
     "envs": envs.envs,
 }
 

@@ -58,18 +58,31 @@ def parse_pairs(flag: str, pairs: Iterable[str]) -> dict[str, Any]:
 def parse_variations(pairs: Iterable[str]) -> list[dict[str, Any]]:
     """Return every combination of ``["n_discs=1-4,7", "source=random"]``.
 
-    :param pairs: texts ``name=value``, a value being a list with commas whose items may be ranges, ends included
+    :param pairs: texts ``name=value``, a value being a list with commas whose items may be ranges, ends included; what
+        stands in brackets, as ``discs=[1,0,0]``, is one item
     :raises ValueError: if one is not of that form
     """
     values: dict[str, list[Any]] = {}
     for pair in pairs:
         name, equals, listed = pair.partition("=")
-        items = [item.strip() for item in listed.split(",")]
+        items = [item.strip() for item in _split(listed)]
         if not equals or not name.isidentifier() or not all(items):
             raise ValueError(f"--set {shortened(pair)} is not accepted; give name=value, a list 5,6,7 or a range 1-8")
         values[name] = [value for item in items for value in _expand(pair, item)]
     combinations = list(product(*values.values()))
     return [dict(zip(values, combination, strict=True)) for combination in combinations]
+
+
+def _split(listed: str) -> list[str]:
+    """Split at the commas that are not in brackets."""
+    items, depth = [""], 0
+    for character in listed:
+        depth += (character in "[{") - (character in "]}")
+        if character == "," and depth <= 0:
+            items.append("")
+        else:
+            items[-1] += character
+    return items
 
 
 def _expand(pair: str, item: str) -> Sequence[Any]:

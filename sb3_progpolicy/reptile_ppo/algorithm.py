@@ -28,7 +28,7 @@ from sb3_progpolicy.reptile.tasks import TaskDistribution, default_tasks
 from sb3_progpolicy.reptile_ppo.environments import make_venv, with_history
 from sb3_progpolicy.reptile_ppo.loading import load_model, parameters_of
 from sb3_progpolicy.reptile_ppo.saving import print_versions, write_model
-from sb3_progpolicy.reptile_ppo.sequence_ppo import SequencePPO
+from sb3_progpolicy.reptile_ppo.sequence_ppo import SequencePPO, largest_divisor
 from sb3_progpolicy.reptile_ppo.theta import Theta
 
 SelfReptilePPO = TypeVar("SelfReptilePPO", bound="ReptilePPO")
@@ -69,8 +69,8 @@ class ReptilePPO(SequencePPO):
         for a program, which is nearly linear in its parameters and takes large steps, and 0.0003 for a network
     :param n_steps: steps of a rollout, per environment
     :param batch_size: transitions per gradient step; recurrent policies take ``batch_size / n_steps`` whole sequences,
-        or, where ``batch_size`` is smaller, sequences of ``batch_size`` steps, which must then divide ``n_steps``. By
-        default an eighth of the rollout, or the next smaller divisor of ``n_steps``
+        or, where ``batch_size`` is smaller, sequences of ``batch_size`` steps, or, with a warning, of the next smaller
+        divisor of ``n_steps``. By default an eighth of the rollout, or the next smaller divisor of ``n_steps``
     :param n_epochs: passes over a rollout
     :param gamma: discount factor
     :param gae_lambda: of generalised advantage estimation
@@ -414,4 +414,4 @@ class ReptilePPO(SequencePPO):
 def _default_batch_size(n_steps: int, n_envs: int) -> int:
     """Return an eighth of a rollout; where that is less than a sequence, the next smaller divisor of its length."""
     size = max(2, n_steps * n_envs // 8)
-    return size if size >= n_steps else max(part for part in range(1, size + 1) if n_steps % part == 0)
+    return size if size >= n_steps else largest_divisor(n_steps, size)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -26,6 +27,11 @@ from sb3_progpolicy.reptile_ppo import update
 from sb3_progpolicy.reptile_ppo.adapters import adapt
 from sb3_progpolicy.reptile_ppo.rollout import Actor, Batch, SequenceBuffer, minibatches
 from sb3_progpolicy.spaces import action_spec
+
+
+def largest_divisor(number: int, limit: int) -> int:
+    """Return the largest divisor of a number up to a limit."""
+    return next(divisor for divisor in range(min(number, limit), 0, -1) if number % divisor == 0)
 
 
 class SequencePPO(PPO):
@@ -75,10 +81,11 @@ class SequencePPO(PPO):
         self.rollout_buffer_class = SequenceBuffer
         super()._setup_model()
         self.adapter = adapt(self.policy)
-        if self.recurrent and self.batch_size < self.n_steps and self.n_steps % self.batch_size:
-            raise ValueError(
-                f"batch_size={self.batch_size} is not accepted with n_steps={self.n_steps}; recurrent policies train "
-                "on whole sequences: batch_size is a divisor of n_steps, or larger than it"
+        if self.recurrent and self.sequence_length < min(self.n_steps, self.batch_size):
+            warnings.warn(
+                f"batch_size={self.batch_size} does not divide n_steps={self.n_steps}: gradient steps are made on "
+                f"{self.batch_size // self.sequence_length} sequences of {self.sequence_length} steps",
+                stacklevel=2,
             )
         if self.action_std is not None and not hasattr(self.policy, "log_std"):
             raise ValueError(f"action_std is for Box actions, not {self.action_space}")
@@ -97,7 +104,7 @@ class SequencePPO(PPO):
     @property
     def sequence_length(self) -> int:
         """Length of the sequences that gradient steps are made on; 1 for a policy without a state."""
-        return min(self.n_steps, self.batch_size) if self.recurrent else 1
+        return largest_divisor(self.n_steps, self.batch_size) if self.recurrent else 1
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         super()._update_learning_rate(optimizers)
@@ -119,8 +126,9 @@ class SequencePPO(PPO):
         callback.on_rollout_start()
         self._follow_schedules()
         actor = self._actor = self.adapter.make_actor(self._last_lstm_states, rollout_buffer, n_rollout_steps, self.rng)
+        length = self.sequence_length
         for step in range(n_rollout_steps):
-            if self.recurrent and step % self.sequence_length == 0:
+            if self.recurrent and step % length == 0:
                 rollout_buffer.sequence_states.append(actor.states)  # type: ignore[arg-type]
             actions = actor.act(self._last_obs, step)  # type: ignore[arg-type]
             new_obs, rewards, dones, infos = env.step(self._to_env(actions))

@@ -14,7 +14,6 @@ DIFFERENCES: Mapping[str, Sequence[str]] = {
     "actor's net_arch": [r"net_arch=.* is not accepted; the actor is a program"],
     "LSTM arguments": [rf"unexpected keyword argument '({LSTM_ARGUMENTS})'"],
     "file format": [r"is not data", r"test_load_bad_zip.*Regex pattern did not match"],
-    "whole sequences": [r"recurrent policies train on whole sequences"],
     "learning speed": [r"test_continuous\b.*Mean reward below threshold"],
     "names": [
         r"test_tensorboard\[ppo\].*assert False",  # looks for the folder PPO_1
