@@ -3,11 +3,14 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
+from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from progpolicy_envs import DOMAINS
-from sb3_progpolicy import TaskDistribution
+from sb3_progpolicy import ReptilePPO, ReptileWrapper, TaskDistribution
+from sb3_progpolicy.reptile.checks import check_variations
 from sb3_progpolicy.reptile.tasks import CurriculumSampler, FailureSampler, RemakeOnVariation, default_tasks
 from sb3_progpolicy.vec_env import make_fast_vec_env
 
@@ -167,3 +170,79 @@ def test_labels_tell_variations_apart():
     assert len({tasks.label(0), tasks.label(1)}) == 2
     assert "n=1" in tasks.label(0)
     assert TaskDistribution([{}]).label(0) == "default"
+
+
+class Bowl(gym.Env):
+    """A number rolls towards 0, by how steep the bowl is; ``colour`` is read and ignored."""
+
+    observation_space = gym.spaces.Box(-10, 10, (1,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, steep=0.1, colour="red"):
+        self.steep, self.colour = steep, colour
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        options = dict(options or {})
+        self.steep, self.colour = options.get("steep", self.steep), options.get("colour", self.colour)
+        self.place = self.np_random.uniform(1, 2)
+        return np.array([self.place], np.float32), {}
+
+    def step(self, action):
+        self.place = (1 - self.steep) * self.place + 0.1 * float(action[0])
+        return np.array([self.place], np.float32), -abs(self.place), False, False, {}
+
+
+def test_variations_that_change_nothing_are_refused_when_training_begins():
+    env = make_vec_env(Bowl, 2, seed=0)
+    ignored = TaskDistribution({"colour": ["red", "blue"]})
+    message = "the variations colour=red and colour=blue do not differ: .* give TaskDistribution check=False"
+    with pytest.raises(ValueError, match=message):
+        PPO("MlpPolicy", env, n_steps=16, batch_size=16).learn(32, callback=ReptileWrapper(ignored))
+    with pytest.raises(ValueError, match=message):
+        ReptilePPO("MlpPolicy", env, n_steps=16, tasks=ignored).learn(32)
+    check_variations(TaskDistribution({"steep": [0.1, 0.2]}), env)  # only the dynamics differ
+    check_variations(TaskDistribution({"colour": ["red", "blue"]}, check=False), env)
+    check_variations(TaskDistribution([{"colour": "red"}]), env)
+    mixed = TaskDistribution({"steep": [0.1, 0.2], "colour": ["red", "blue"]})
+    with pytest.raises(ValueError, match=r"steep=0.1,colour=red and steep=0.1,colour=blue do not differ"):
+        check_variations(mixed, env)
+
+
+@pytest.mark.parametrize("domain", [d for d in DOMAINS.values() if not d.simulation], ids=lambda d: d.id)
+@pytest.mark.parametrize("n_envs", [1, 4])
+def test_variations_of_the_domains_differ(domain, n_envs):
+    check_variations(TaskDistribution(domain.train), make_fast_vec_env(domain.id, n_envs))
+
+
+def test_check_leaves_training_as_it_is():
+    parameters = []
+    for check in (True, False):
+        tasks = TaskDistribution(DOMAINS["Stacking-v0"].train, check=check)
+        model = ReptilePPO("ProgPolicy", "Stacking-v0", n_envs=4, n_steps=16, tasks=tasks, seed=0).learn(256)
+        parameters.append([tensor.detach().clone() for tensor in model.policy.parameters()])
+    assert all(th.equal(one, other) for one, other in zip(*parameters, strict=True))
+
+
+def test_split_by_seed():
+    tasks = TaskDistribution({"length": [0.1 * n for n in range(10)], "mass": [1, 2]}, sampler="curriculum")
+    train, validation, unseen = tasks.split(validation=0.1, unseen=4, seed=3)
+    assert (len(train), len(validation), len(unseen)) == (14, 2, 4)
+    parts = [*train.variations, *validation, *unseen]
+    assert sorted(map(str, parts)) == sorted(map(str, tasks.variations)), "each is in one of them"
+    assert train.variations == [v for v in tasks.variations if v in train.variations], "the order stays"
+    assert type(train.sampler) is type(tasks.sampler)
+    again = tasks.split(validation=0.1, unseen=4, seed=3)
+    assert (again[0].variations, again[1:]) == (train.variations, (validation, unseen))
+    assert tasks.split(0.1, 4, seed=4)[2] != unseen
+
+
+@pytest.mark.parametrize("parts", [{"validation": 0.5, "unseen": 0.5}, {"unseen": -1}, {"unseen": 1.5}, {"unseen": 20}])
+def test_split_that_is_not_accepted(parts):
+    with pytest.raises(ValueError, match=r"is not accepted|leave none of 20 variations"):
+        TaskDistribution({"length": range(20)}).split(**parts)
+
+
+def test_drawn_values_are_not_split():
+    with pytest.raises(ValueError, match="cannot be split; give lists"):
+        TaskDistribution({"length": lambda rng: rng.uniform()}).split()

@@ -10,6 +10,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_progpolicy.finite import check_parameters, check_step
+from sb3_progpolicy.reptile.checks import check_variations
 from sb3_progpolicy.reptile.statistics import EpisodeStatistics
 from sb3_progpolicy.reptile.steps import MetaOptimizer, MetaOptimizerName, Task, begin_task
 from sb3_progpolicy.reptile.tasks import TaskDistribution
@@ -85,6 +86,7 @@ class ReptileWrapper(BaseCallback):
     def _on_training_start(self) -> None:
         # SB3 does so after the first rollout only; until then a model trained before would still be at its end.
         self.model._update_current_progress_remaining(self.model.num_timesteps, max(1, self.model._total_timesteps))
+        check_variations(self.tasks, self.training_env)
 
     def _on_rollout_start(self) -> None:
         if self._updates_of_task == self.inner_updates:

@@ -107,6 +107,8 @@ class TaskDistribution:
         keep in force over the episodes that follow, as all of ``progpolicy_envs`` do; ``"attributes"`` by setting
         attributes of the environment, ``"constructor"`` by making the environment anew (see
         :class:`RemakeOnVariation`)
+    :param check: whether training begins with a check that no two variations are the same, see
+        :func:`~sb3_progpolicy.reptile.checks.check_variations`
     :raises ValueError: if there is no variation, a name is not known, or some variations leave a parameter out (which
         is accepted with ``apply="constructor"`` alone, where it has its default value)
     """
@@ -119,6 +121,7 @@ class TaskDistribution:
         variations: Mapping[str, Any] | Sequence[Mapping[str, Any]],
         sampler: str | Sampler = "uniform",
         apply: Apply = "options",
+        check: bool = True,
     ) -> None:
         self.variations = _enumerate(variations)
         if not self.variations:
@@ -136,11 +139,41 @@ class TaskDistribution:
                 f"variations={variations!r} is not accepted; some of them leave out {', '.join(left_out)}, which would "
                 "stay what the task before made it. Give every variation a value for it"
             )
-        self.sampler, self.apply = sampler, apply
+        self.sampler, self.apply, self.check = sampler, apply, check
         self.success_rates = np.full(len(self.variations), np.nan)
 
     def __len__(self) -> int:
         return len(self.variations)
+
+    def split(
+        self, validation: float | int = 0.2, unseen: float | int = 0.2, seed: int = 0
+    ) -> tuple[TaskDistribution, tuple[Variation, ...], tuple[Variation, ...]]:
+        """Split the variations by chance into those to train on, to choose by and to test on.
+
+        :param validation: how many to choose hyperparameters by: a share, 0 to 1, or a number
+        :param unseen: how many to test on, likewise
+        :param seed: of the draw
+        :return: the distribution of the others, in the order that they have here; the validation variations; the unseen
+        :raises ValueError: if a number is not accepted, nothing is left to train on, or values are drawn (callables)
+        """
+        if any(callable(value) for variation in self.variations for value in variation.values()):
+            raise ValueError("variations whose values are drawn cannot be split; give lists of values")
+        counts = []
+        for name, part in (("validation", validation), ("unseen", unseen)):
+            count = round(part * len(self)) if isinstance(part, float) else part
+            if isinstance(part, bool) or not count >= 0 or (isinstance(part, float) and not 0 <= part <= 1):
+                raise ValueError(f"{name}={part!r} is not accepted; it is a share from 0.0 to 1.0, or a whole number")
+            counts.append(count)
+        if sum(counts) >= len(self):
+            raise ValueError(
+                f"validation={validation} and unseen={unseen} leave none of {len(self)} variations to train on"
+            )
+        order = np.random.default_rng(seed).permutation(len(self)).tolist()
+        first, second = counts[0], sum(counts)
+        held = [sorted(order[:first]), sorted(order[first:second])]
+        train = [self.variations[index] for index in sorted(order[second:])]
+        chosen, tested = (tuple(self.variations[index] for index in indices) for indices in held)
+        return TaskDistribution(train, self.sampler, self.apply, self.check), chosen, tested
 
     def sample(self, rng: np.random.Generator, progress: float = 0.0, n_tasks: int = 1) -> list[tuple[int, Variation]]:
         """Draw tasks, of different variations as long as the sampler lets in enough of them.

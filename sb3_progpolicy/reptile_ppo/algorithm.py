@@ -22,6 +22,7 @@ from sb3_progpolicy.normalization import NormalizingExtractor
 from sb3_progpolicy.policies import ProgrammaticActorCritic, ProgrammaticPolicy, RecurrentProgrammaticPolicy
 from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.reptile.callback import check_reptile_arguments, start_task
+from sb3_progpolicy.reptile.checks import check_variations
 from sb3_progpolicy.reptile.statistics import EpisodeStatistics
 from sb3_progpolicy.reptile.steps import MetaOptimizer, MetaOptimizerName, Task, begin_task
 from sb3_progpolicy.reptile.tasks import TaskDistribution, default_tasks
@@ -242,6 +243,7 @@ class ReptilePPO(SequencePPO):
         )
         self._update_current_progress_remaining(self.num_timesteps, max(1, total_timesteps))
         learning = _Learning(callback, log_interval)
+        check_variations(self.tasks, self.env)
         callback.on_training_start(locals(), globals())
         while self._goes_on(learning) and self._search_goes_on():  # line 3
             self._meta_iterate(learning)  # lines 4-8

@@ -164,7 +164,7 @@ def _tasks(data: Mapping[str, Any]) -> TaskDistribution:
     if data["sampler"] not in SAMPLERS:
         raise ModelFormatError(f"sampler={data['sampler']!r:.40} is not accepted; known: {', '.join(SAMPLERS)}")
     sampler = SAMPLERS[data["sampler"]](**data["sampler_arguments"])
-    tasks = TaskDistribution(data["variations"], sampler, data["apply"])
+    tasks = TaskDistribution(data["variations"], sampler, data["apply"], data.get("check", True))
     rates = [np.nan if rate is None else float(rate) for rate in data["success_rates"]]
     if len(rates) != len(tasks):
         raise ModelFormatError(f"success_rates: {len(rates)} given for {len(tasks)} variations")

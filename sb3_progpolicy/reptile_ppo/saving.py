@@ -228,6 +228,7 @@ def _tasks_to_plain(tasks: TaskDistribution) -> Any:
         "variations": tasks.variations,
         "sampler": samplers[type(tasks.sampler)],
         "sampler_arguments": dict(vars(tasks.sampler)),
+        "check": tasks.check,
         "apply": tasks.apply,
         "success_rates": [None if np.isnan(rate) else float(rate) for rate in tasks.success_rates],
     }
