@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sb3_progpolicy.cli import benchmark, envs, evaluate, plan, play, render, show, train, tune
+from sb3_progpolicy.cli import benchmark, card, compare, envs, evaluate, plan, play, render, show, train, tune
 from sb3_progpolicy.cli.parsing import repeat_flags
 from sb3_progpolicy.nearest import unknown
 
@@ -27,6 +27,8 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "train": train.train,
     "tune": tune.tune,
     "evaluate": evaluate.evaluate,
+    "compare": compare.compare,
+    "card": card.card,
     "show": show.show,
     "render": render.render,
     "play": play.play,

@@ -75,7 +75,7 @@ def _from_run(folder: Path, allow_pickle: bool) -> Source:
             return _from_program(str(folder), program, dict(config.env_kwargs))
     if not (folder / MODEL).is_file():
         raise ValueError(f"{folder} holds no model yet")
-    return _from_model(folder / MODEL, allow_pickle)
+    return replace(_from_model(folder / MODEL, allow_pickle), name=str(folder))
 
 
 def _from_model(path: Path, allow_pickle: bool) -> Source:

@@ -1,0 +1,136 @@
+"""Model cards: how a run was trained, what it reaches on each variation, its program and a film."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from progpolicy_envs import DOMAINS
+from sb3_progpolicy.evaluation import Evaluation, evaluate_model, evaluate_program
+from sb3_progpolicy.experiment.film import record
+from sb3_progpolicy.experiment.folder import CONFIG, VERSIONS, read_config, timesteps_of
+from sb3_progpolicy.experiment.methods import METHODS
+from sb3_progpolicy.experiment.sources import Source
+from sb3_progpolicy.hyperparams import read_yaml
+from sb3_progpolicy.programs import export_text
+from sb3_progpolicy.programs.files import write_atomically
+
+
+def evaluate_source(
+    source: Source, variations: Sequence[Mapping[str, Any]], n_episodes: int, seed: int = 0
+) -> list[Evaluation]:
+    """Run what a name stands for on variations: a program crisp, as it is read, or a model.
+
+    :param source: from :func:`~sb3_progpolicy.experiment.sources.find_source`
+    :param variations: one for each row of the result
+    :param n_episodes: on each
+    :param seed: of the environments
+    :raises ValueError: if the environment is not known
+    """
+    if source.env_id is None:
+        raise ValueError(f"{source.name} does not say which environment it is for")
+    common: dict[str, Any] = {"seed": seed, "env_kwargs": source.env_kwargs}
+    if source.program is not None:
+        return evaluate_program(source.program, source.env_id, variations, n_episodes, "crisp", **common)
+    assert source.model is not None
+    return evaluate_model(source.model, source.env_id, variations, n_episodes, **common)
+
+
+def write_card(
+    source: Source,
+    folder: Path | None,
+    variations: Sequence[Mapping[str, Any]],
+    output: Path,
+    n_episodes: int = 20,
+    film: bool = True,
+) -> None:
+    """Write a model card in Markdown and, beside it, the film that it shows.
+
+    :param source: what the card is of
+    :param folder: of the run, if it is one
+    :param variations: to evaluate on; the last is filmed
+    :param output: file to write, ``.md``
+    :param n_episodes: on each variation
+    :param film: whether to film a program
+    """
+    rows = evaluate_source(source, variations, n_episodes)
+    lines = [f"# {_title(source, folder)}", "", *_training(source, folder), *_table(source, rows, n_episodes)]
+    if source.program is not None:
+        if film:
+            picture = output.with_suffix(".gif")
+            steps, success = record(source, picture, variations[-1])
+            words = ", ".join(f"{name} {value}" for name, value in variations[-1].items())
+            outcome = "goal reached" if success else "goal not reached"
+            lines += ["## Film", "", f"![{words}: {steps} steps, {outcome}]({picture.name})", ""]
+            lines += [f"{words}: {steps} steps, {outcome}.", ""]
+        lines += ["## Program", "", "```", export_text(source.program).rstrip(), "```", ""]
+    write_atomically(output, "\n".join(lines))
+
+
+def _title(source: Source, folder: Path | None) -> str:
+    algo = "" if folder is None else f"{read_config(folder).algo} on "
+    return f"{algo}{source.env_id}"
+
+
+def _training(source: Source, folder: Path | None) -> list[str]:
+    if folder is None:
+        known = {} if source.program is None else source.program.metadata
+        facts = [f"* {name}: {value}" for name, value in known.items() if not isinstance(value, (dict, list))]
+        return ["## Training", "", *(facts or ["Nothing is known of it."]), ""]
+    config = read_config(folder)
+    method = METHODS[config.algo]
+    steps = timesteps_of(folder / "model.zip")
+    again = f"progpolicy train --algo {config.algo} --env {config.env} --seed {config.seed}"
+    lines = [
+        "## Training",
+        "",
+        f"* Method: `{method.name}`, {method.description} ({method.source})",
+        f"* Environment: `{config.env}` {dict(config.env_kwargs) or ''}".rstrip(),
+        f"* Steps: {'unknown' if steps is None else steps} of {config.n_timesteps}",
+        f"* Seed: {config.seed}",
+    ]
+    domain = DOMAINS.get(config.env.rpartition(":")[2])
+    tasks = config.hyperparams.get("tasks")
+    if tasks is not None:
+        lines.append(f"* Trained on: {tasks}")
+    elif domain is not None and method.across_variations:
+        lines.append(f"* Trained on: {', '.join(str(variation) for variation in domain.train)}")
+    path = folder / VERSIONS
+    if path.is_file():
+        versions = read_yaml(path.read_text(encoding="utf-8"))
+        lines.append("* Versions: " + ", ".join(f"{name} {version}" for name, version in versions.items()))
+    hyperparams = yaml.safe_dump(dict(config.hyperparams), sort_keys=False).rstrip()
+    return [
+        *lines,
+        "",
+        f"`{again}` with the hyperparameters below (`{CONFIG}` in its folder) trains it again:",
+        "",
+        "```yaml",
+        hyperparams,
+        "```",
+        "",
+    ]
+
+
+def _table(source: Source, rows: Sequence[Evaluation], n_episodes: int) -> list[str]:
+    domain = DOMAINS.get((source.env_id or "").rpartition(":")[2])
+    lines = [
+        "## Results",
+        "",
+        f"{n_episodes} episodes on each variation; one that fails counts as the cap on steps. "
+        + ("The program is run crisp, as it is read." if source.program is not None else "Most likely actions."),
+        "",
+        "| variation | training | success | steps | planner | ratio |",
+        "|---|---|---:|---:|---:|---:|",
+    ]
+    for row in rows:
+        relation = "" if domain is None or domain.size not in row.variation else domain.relation(dict(row.variation))
+        name = ", ".join(f"{key} {value}" for key, value in row.variation.items()) or "as it is"
+        optimum = "-" if row.optimal_steps_mean is None else f"{row.optimal_steps_mean:.1f}"
+        ratio = "-" if row.ratio is None else f"{row.ratio:.2f}"
+        steps = f"{row.steps_mean:.1f} ± {row.steps_std:.1f}"
+        lines.append(f"| {name} | {relation} | {row.success_rate:.0%} | {steps} | {optimum} | {ratio} |")
+    return [*lines, ""]
