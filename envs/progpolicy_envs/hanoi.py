@@ -129,6 +129,7 @@ class HanoiEnv(PlanningEnv):
     ## Arguments
     ``gym.make("Hanoi-v0", n_discs=5)`` or ``env.reset(options={"n_discs": 5})``; an option stays in force until it
     is changed. Values that are not accepted raise ``ValueError``.
+    ``context="observed"``, for ``gym.make``, adds the variation's numbers, from 0 to 1, to the end of observations.
 
     | Parameter  | Values             | Default | Meaning                                   |
     |------------|--------------------|---------|-------------------------------------------|
@@ -144,14 +145,20 @@ class HanoiEnv(PlanningEnv):
     """
 
     variations: ClassVar[VariationSpace] = VARIATIONS
-    observation_names: ClassVar[tuple[str, ...]] = OBSERVATION_NAMES
+    observation_names: tuple[str, ...] = OBSERVATION_NAMES
     action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
 
     def __init__(
-        self, n_discs: int = 3, source: int | str = 0, target: int | str = 2, render_mode: str | None = None
+        self,
+        n_discs: int = 3,
+        source: int | str = 0,
+        target: int | str = 2,
+        render_mode: str | None = None,
+        context: str = "hidden",
     ) -> None:
-        super().__init__({"n_discs": n_discs, "source": source, "target": target}, render_mode)
-        self.observation_space = _OBSERVATION_SPACE
+        super().__init__(
+            {"n_discs": n_discs, "source": source, "target": target}, _OBSERVATION_SPACE, render_mode, context
+        )
         self.action_space = spaces.Discrete(len(MOVES))
         self.source, self.target = 0, 0
         self.discs: list[int] = []
@@ -173,7 +180,7 @@ class HanoiEnv(PlanningEnv):
         solved = all(peg == self.target for peg in self.discs)
         reward += GOAL_REWARD * solved
         self._show()
-        return self._observe(), reward, solved, False, {"is_success": solved}
+        return self._observation(), reward, solved, False, {"is_success": solved}
 
     def _draw(self, variation: Variation) -> None:
         self.source, self.target = _draw_pegs(_peg_pairs(variation), self.np_random)
@@ -257,7 +264,7 @@ class HanoiVectorEnv(PlanningVectorEnv):
     """
 
     variations: ClassVar[VariationSpace] = VARIATIONS
-    observation_names: ClassVar[tuple[str, ...]] = OBSERVATION_NAMES
+    observation_names: tuple[str, ...] = OBSERVATION_NAMES
     action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
 
     _FROM, _TO = (np.array(column) for column in zip(*MOVES, strict=True))
@@ -272,9 +279,11 @@ class HanoiVectorEnv(PlanningVectorEnv):
         source: int | str = 0,
         target: int | str = 2,
         max_episode_steps: int | None = None,
+        context: str = "hidden",
     ) -> None:
         variation = self.variations.update({}, {"n_discs": n_discs, "source": source, "target": target})
-        super().__init__(num_envs, _OBSERVATION_SPACE, spaces.Discrete(len(MOVES)), variation, max_episode_steps)
+        actions = spaces.Discrete(len(MOVES))
+        super().__init__(num_envs, _OBSERVATION_SPACE, actions, variation, max_episode_steps, context)
         self._bits = np.zeros((num_envs, N_PEGS), dtype=np.int64)
         self._tops = np.zeros((num_envs, N_PEGS), dtype=np.int64)
         self._n_discs = np.zeros(num_envs, dtype=np.int64)

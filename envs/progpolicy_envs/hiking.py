@@ -29,7 +29,7 @@ class _WholeMap(MapView):
     hiker_value: ClassVar[float] = 1.0
     n_numbers: ClassVar[int] = N_CELLS
     places: ClassVar[NDArray[np.int64]] = np.arange(N_CELLS)
-    observation_names: ClassVar[tuple[str, ...]] = tuple(
+    observation_names: tuple[str, ...] = tuple(
         f"map[{row},{column}]" for row in range(N_ROWS) for column in range(N_COLUMNS)
     )
 
@@ -43,7 +43,7 @@ class _FramedMap(MapView):
     places: ClassVar[NDArray[np.int64]] = (
         (np.arange(N_CELLS) // N_COLUMNS + REACH) * _FRAME_WIDTH + np.arange(N_CELLS) % N_COLUMNS + REACH
     )
-    observation_names: ClassVar[tuple[str, ...]] = tuple(f"window[{down:+d},{right:+d}]" for down, right in _WINDOW)
+    observation_names: tuple[str, ...] = tuple(f"window[{down:+d},{right:+d}]" for down, right in _WINDOW)
 
 
 _SECTIONS = {
@@ -78,6 +78,7 @@ _SECTIONS = {
         ## Arguments
         ``gym.make("$id", n_stars=5, layout="fork")`` or ``env.reset(options={"n_stars": 5})``; an option stays in
         force until it is changed. Values that are not accepted raise ``ValueError``.
+        ``context="observed"``, for ``gym.make``, adds the variation's numbers, from 0 to 1, to the end of observations.
 
         | Parameter   | Values                                                          | Default | Meaning         |
         |-------------|-----------------------------------------------------------------|---------|-----------------|
@@ -149,10 +150,11 @@ class HikingEnv(_WholeMap, PathwayEnv):
         n_stars: int = 3,
         layout: str | Sequence[str] = "valley",
         render_mode: str | None = None,
+        context: str = "hidden",
         observation: None = None,
     ) -> None:
         _refuse_observation(observation)
-        super().__init__(n_stars, layout, render_mode)
+        super().__init__(n_stars, layout, render_mode, context)
 
     def _seen(self, numbers: NDArray[np.float32]) -> NDArray[np.float32]:
         return numbers
@@ -202,10 +204,11 @@ class HikingVectorEnv(_WholeMap, PathwayVectorEnv):
         n_stars: int = 3,
         layout: str | Sequence[str] = "valley",
         max_episode_steps: int | None = None,
+        context: str = "hidden",
         observation: None = None,
     ) -> None:
         _refuse_observation(observation)
-        super().__init__(num_envs, n_stars, layout, max_episode_steps)
+        super().__init__(num_envs, n_stars, layout, max_episode_steps, context)
 
     def _observe(self) -> NDArray[np.float32]:
         return self._numbers.copy()

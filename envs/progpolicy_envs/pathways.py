@@ -175,10 +175,13 @@ class PathwayEnv(MapView, PlanningEnv):
     action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
 
     def __init__(
-        self, n_stars: int = 3, layout: str | Sequence[str] = "valley", render_mode: str | None = None
+        self,
+        n_stars: int = 3,
+        layout: str | Sequence[str] = "valley",
+        render_mode: str | None = None,
+        context: str = "hidden",
     ) -> None:
-        super().__init__({"n_stars": n_stars, "layout": layout}, render_mode)
-        self.observation_space = _OBSERVATION_SPACE
+        super().__init__({"n_stars": n_stars, "layout": layout}, _OBSERVATION_SPACE, render_mode, context)
         self.action_space = spaces.Discrete(len(ACTION_NAMES))
         self.n_stars = 0
         self.hiker = 0
@@ -202,7 +205,7 @@ class PathwayEnv(MapView, PlanningEnv):
             reward += STAR_REWARD
         solved = not self.stars
         self._show()
-        return self._observe(), reward, solved, False, {"is_success": solved}
+        return self._observation(), reward, solved, False, {"is_success": solved}
 
     def _draw(self, variation: Variation) -> None:
         layout, stars = draw_task(self.np_random, variation)
@@ -276,9 +279,11 @@ class PathwayVectorEnv(MapView, PlanningVectorEnv):
         n_stars: int = 3,
         layout: str | Sequence[str] = "valley",
         max_episode_steps: int | None = None,
+        context: str = "hidden",
     ) -> None:
         variation = self.variations.update({}, {"n_stars": n_stars, "layout": layout})
-        super().__init__(num_envs, _OBSERVATION_SPACE, spaces.Discrete(len(ACTION_NAMES)), variation, max_episode_steps)
+        actions = spaces.Discrete(len(ACTION_NAMES))
+        super().__init__(num_envs, _OBSERVATION_SPACE, actions, variation, max_episode_steps, context)
         self._numbers = np.full((num_envs, self.n_numbers), BLOCKED, dtype=np.float32)
         self._first_places = self._rows * self.n_numbers
         self._hikers = np.zeros(num_envs, dtype=np.int64)

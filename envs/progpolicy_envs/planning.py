@@ -38,7 +38,7 @@ class PlanningEnv(DomainEnv):
             raise ValueError(f"{unknown} are not parts of a state; its parts are {', '.join(present)}")
         self._set_state({**present, **state})
         self._show()
-        return self._observe()
+        return self._observation()
 
     def plan(self) -> list[int]:
         """Return the actions of a shortest solution from the present state.

@@ -7,10 +7,12 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 
 from progpolicy_envs.rendering import Display
-from progpolicy_envs.variation import Variation, VariationSpace
+from progpolicy_envs.variation import Variation, VariationSpace, with_context
 
 
 def require_reset(started: bool, call: str) -> None:
@@ -23,13 +25,28 @@ class DomainEnv(gym.Env[Any, Any], ABC):
     """One environment of a task domain.
 
     :param variation: the variation in force
+    :param observation_space: of what a subclass observes
     :param render_mode: one of those in ``metadata``, or ``None``
-    :raises ValueError: if the variation is not accepted
+    :param context: ``"observed"`` if observations end with the variation's numbers, ``"hidden"`` if not
+    :raises ValueError: if a value is not accepted
     """
 
     variations: ClassVar[VariationSpace]
+    #: Names of the numbers of an observation.
+    observation_names: tuple[str, ...] = ()
 
-    def __init__(self, variation: Mapping[str, Any], render_mode: str | None = None) -> None:
+    def __init__(
+        self,
+        variation: Mapping[str, Any],
+        observation_space: spaces.Space[Any],
+        render_mode: str | None = None,
+        context: str = "hidden",
+    ) -> None:
+        names = self.variations.context_names
+        self.observation_space = with_context(observation_space, names, context)
+        self.context = context
+        if context == "observed":
+            self.observation_names = (*type(self).observation_names, *names)
         self.variation: Variation = self.variations.update({}, variation)
         self.render_mode = render_mode
         self._display = Display(self.metadata["render_fps"])
@@ -53,11 +70,18 @@ class DomainEnv(gym.Env[Any, Any], ABC):
         self.variation = variation
         self._started = True
         self._show()
-        return self._observe(), {"is_success": False, "variation": dict(variation), **self._reset_info()}
+        return self._observation(), {"is_success": False, "variation": dict(variation), **self._reset_info()}
 
     def close(self) -> None:
         """Close the window, if there is one."""
         self._display.close()
+
+    def _observation(self) -> Any:
+        """Return the observation, with the variation's numbers if they are observed."""
+        observation = self._observe()
+        if self.context == "hidden":
+            return observation
+        return np.concatenate([observation, self.variations.encode(self.variation)], dtype=np.float32)
 
     def _show(self) -> None:
         """Show the state in the window; to be called after each change of it."""
@@ -78,7 +102,7 @@ class DomainEnv(gym.Env[Any, Any], ABC):
 
     @abstractmethod
     def _observe(self) -> Any:
-        """Return the observation."""
+        """Return the observation, without the variation's numbers."""
 
     @abstractmethod
     def _frame(self) -> Any:

@@ -126,6 +126,7 @@ class StackingEnv(PlanningEnv):
     ## Arguments
     ``gym.make("Stacking-v0", n_plates=5)`` or ``env.reset(options={"n_plates": 5})``; an option stays in force until
     it is changed. Values that are not accepted raise ``ValueError``.
+    ``context="observed"``, for ``gym.make``, adds the variation's numbers, from 0 to 1, to the end of observations.
 
     | Parameter | Values | Default | Meaning          |
     |-----------|--------|---------|------------------|
@@ -140,12 +141,11 @@ class StackingEnv(PlanningEnv):
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array", "ansi"], "render_fps": 6}
     variations: ClassVar[VariationSpace] = VARIATIONS
-    observation_names: ClassVar[tuple[str, ...]] = OBSERVATION_NAMES
+    observation_names: tuple[str, ...] = OBSERVATION_NAMES
     action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
 
-    def __init__(self, n_plates: int = 3, render_mode: str | None = None) -> None:
-        super().__init__({"n_plates": n_plates}, render_mode)
-        self.observation_space = _OBSERVATION_SPACE
+    def __init__(self, n_plates: int = 3, render_mode: str | None = None, context: str = "hidden") -> None:
+        super().__init__({"n_plates": n_plates}, _OBSERVATION_SPACE, render_mode, context)
         self.action_space = spaces.Discrete(len(ACTION_NAMES))
         self.n_plates = 0
         self.plates: list[Cell] = []
@@ -175,7 +175,7 @@ class StackingEnv(PlanningEnv):
                 reward += ILLEGAL_REWARD
         solved = not self.plates
         self._show()
-        return self._observe(), reward, solved, False, {"is_success": solved}
+        return self._observation(), reward, solved, False, {"is_success": solved}
 
     def _draw(self, variation: Variation) -> None:
         cells, gripper = draw_task(self.np_random, variation)
@@ -231,14 +231,21 @@ class StackingVectorEnv(PlanningVectorEnv):
     """
 
     variations: ClassVar[VariationSpace] = VARIATIONS
-    observation_names: ClassVar[tuple[str, ...]] = OBSERVATION_NAMES
+    observation_names: tuple[str, ...] = OBSERVATION_NAMES
     action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
 
     _MOVES = np.array([*DIRECTIONS.values(), (0, 0)])
 
-    def __init__(self, num_envs: int = 1, n_plates: int = 3, max_episode_steps: int | None = None) -> None:
+    def __init__(
+        self,
+        num_envs: int = 1,
+        n_plates: int = 3,
+        max_episode_steps: int | None = None,
+        context: str = "hidden",
+    ) -> None:
         variation = self.variations.update({}, {"n_plates": n_plates})
-        super().__init__(num_envs, _OBSERVATION_SPACE, spaces.Discrete(len(ACTION_NAMES)), variation, max_episode_steps)
+        actions = spaces.Discrete(len(ACTION_NAMES))
+        super().__init__(num_envs, _OBSERVATION_SPACE, actions, variation, max_episode_steps, context)
         self._numbers = np.zeros((num_envs, len(OBSERVATION_NAMES)), dtype=np.float32)
         self._grippers = np.zeros((num_envs, 2), dtype=np.int64)
         self._n_plates = np.full(num_envs, n_plates)

@@ -8,7 +8,13 @@ from difflib import get_close_matches
 from numbers import Integral
 from typing import Any, ClassVar
 
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
 Variation = dict[str, Any]
+#: Whether the variation's numbers are part of the observation.
+CONTEXTS = ("hidden", "observed")
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,19 @@ class IntParameter:
     def allowed(self) -> str:
         """The accepted values in words."""
         return " or ".join((f"an integer from {self.low} to {self.high}", *map(repr, self.names)))
+
+    @property
+    def context_names(self) -> tuple[str, ...]:
+        """Names of the numbers that :meth:`encode` returns."""
+        return (self.name, *(f"{self.name}={name}" for name in self.names))
+
+    def encode(self, value: int | str) -> list[float]:
+        """Return a value as numbers from 0 to 1: where it lies between the bounds, then one for each of the names.
+
+        :param value: an accepted one
+        """
+        place = 0.0 if isinstance(value, str) else (value - self.low) / max(1, self.high - self.low)
+        return [place, *(float(value == name) for name in self.names)]
 
     def parse(self, value: Any) -> int | str:
         """Return ``value`` as an ``int``, or the name.
@@ -71,6 +90,18 @@ class ChoiceParameter:
     def allowed(self) -> str:
         """The accepted values in words."""
         return "one of " + ", ".join(repr(choice) for choice in self.choices)
+
+    @property
+    def context_names(self) -> tuple[str, ...]:
+        """Names of the numbers that :meth:`encode` returns."""
+        return tuple(f"{self.name}={choice}" for choice in self.choices)
+
+    def encode(self, value: str) -> list[float]:
+        """Return a value as one number for each of the choices, 1 where it is this one.
+
+        :param value: an accepted one
+        """
+        return [float(value == choice) for choice in self.choices]
 
     def parse(self, value: Any) -> str:
         """Return ``value`` unchanged.
@@ -154,6 +185,20 @@ class VariationSpace(Mapping[str, Parameter]):
         """The variation of an environment that is made without arguments."""
         return {name: parameter.default for name, parameter in self.items()}
 
+    @property
+    def context_names(self) -> tuple[str, ...]:
+        """Names of the numbers that :meth:`encode` returns."""
+        return tuple(name for parameter in self.values() for name in parameter.context_names)
+
+    def encode(self, variation: Mapping[str, Any]) -> NDArray[np.float32]:
+        """Return a variation as numbers from 0 to 1, which a policy may be shown.
+
+        :param variation: a value for every parameter
+        :return: ``(len(context_names),)``
+        """
+        numbers = [number for name, parameter in self.items() for number in parameter.encode(variation[name])]
+        return np.array(numbers, dtype=np.float32)
+
     def _named(self, name: str) -> Parameter:
         if name not in self._parameters:
             near = get_close_matches(str(name), [*self._parameters, *self.starts], n=1)
@@ -163,3 +208,21 @@ class VariationSpace(Mapping[str, Parameter]):
             known += f"; for one episode: {once}" if once else ""
             raise ValueError(f"unknown variation parameter {name!r}{hint}; known: {known}")
         return self._parameters[name]
+
+
+def with_context(space: spaces.Space[Any], names: tuple[str, ...], context: str) -> spaces.Space[Any]:
+    """Return an observation space with room for the numbers of a variation, if they are observed.
+
+    :param space: without them
+    :param names: of the numbers
+    :param context: ``"hidden"`` or ``"observed"``
+    :raises ValueError: if it is neither, or the observation is not one array
+    """
+    if context not in CONTEXTS:
+        raise ValueError(f"context={context!r} is not accepted; it is one of {', '.join(map(repr, CONTEXTS))}")
+    if context == "hidden":
+        return space
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise ValueError(f"context={context!r} is not accepted with this observation; it is for one array of numbers")
+    zeros, ones = np.zeros(len(names), np.float32), np.ones(len(names), np.float32)
+    return spaces.Box(np.concatenate([space.low, zeros]), np.concatenate([space.high, ones]), dtype=np.float32)

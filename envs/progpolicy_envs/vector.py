@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from progpolicy_envs.single import require_reset
 from progpolicy_envs.states import is_sequence
-from progpolicy_envs.variation import Variation, VariationSpace
+from progpolicy_envs.variation import Variation, VariationSpace, with_context
 
 Infos = dict[str, Any]
 
@@ -33,10 +33,13 @@ class DomainVectorEnv(VectorEnv, ABC):
     :param action_space: of one environment
     :param variation: the variation in force in every environment
     :param max_episode_steps: steps after which an episode is truncated; ``None`` or -1 for no limit
+    :param context: ``"observed"`` if observations end with the variation's numbers, ``"hidden"`` if not
     """
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
     variations: ClassVar[VariationSpace]
+    #: Names of the numbers of an observation.
+    observation_names: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -45,8 +48,13 @@ class DomainVectorEnv(VectorEnv, ABC):
         action_space: Space[Any],
         variation: Variation,
         max_episode_steps: int | None,
+        context: str = "hidden",
     ) -> None:
         check_num_envs(num_envs)
+        observation_space = with_context(observation_space, self.variations.context_names, context)
+        self.context = context
+        if context == "observed":
+            self.observation_names = (*type(self).observation_names, *self.variations.context_names)
         self.num_envs = num_envs
         self.single_observation_space = observation_space
         self.single_action_space = action_space
@@ -62,6 +70,7 @@ class DomainVectorEnv(VectorEnv, ABC):
         self.row_variations: list[Variation] = [dict(variation) for _ in range(num_envs)]
         self._elapsed = np.zeros(num_envs, dtype=np.int64)
         self._rows = np.arange(num_envs)
+        self._context = np.stack([self.variations.encode(variation)] * num_envs)
         self._generators: list[np.random.Generator] = [np.random.default_rng() for _ in range(num_envs)]
         self._started = False
 
@@ -82,7 +91,7 @@ class DomainVectorEnv(VectorEnv, ABC):
         self._started = False
         before, self.row_variations = self.row_variations, variations
         if options:
-            self._read_variations()
+            self._changed_variations()
         self._elapsed[:] = 0
         self._reset_rows(self._rows)
         try:
@@ -91,10 +100,10 @@ class DomainVectorEnv(VectorEnv, ABC):
                     self._set_start(row, start)
         except ValueError:
             self.row_variations = before
-            self._read_variations()
+            self._changed_variations()
             raise
         self._started = True
-        return self._observe(), self._reset_infos()
+        return self._observation(), self._reset_infos()
 
     def step(
         self, actions: NDArray[Any]
@@ -109,15 +118,27 @@ class DomainVectorEnv(VectorEnv, ABC):
         rewards, terminated, infos = self._apply(self._checked(np.asarray(actions)))
         self._elapsed += 1
         truncated = (self._elapsed >= self.max_episode_steps) & ~terminated
-        observations = self._observe()
+        observations = self._observation()
         done = terminated | truncated
         (ended,) = done.nonzero()
         if len(ended):
             infos.update(_final(observations, infos, done, ended))
             self._elapsed[ended] = 0
             self._reset_rows(ended)
-            observations = self._observe()
+            observations = self._observation()
         return observations, rewards, terminated, truncated, infos
+
+    def _changed_variations(self) -> None:
+        self._read_variations()
+        if self.context == "observed":
+            self._context = np.stack([self.variations.encode(variation) for variation in self.row_variations])
+
+    def _observation(self) -> Any:
+        """Return the observations, with the variations' numbers if they are observed."""
+        observations = self._observe()
+        if self.context == "hidden":
+            return observations
+        return np.concatenate([observations, self._context], axis=1, dtype=np.float32)
 
     @abstractmethod
     def _checked(self, actions: NDArray[Any]) -> NDArray[Any]:

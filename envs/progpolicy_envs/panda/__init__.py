@@ -49,8 +49,10 @@ class _ObjectsEnv(PandaEnv):
         reward_type: str = "dense",
         render_mode: str | None = None,
         physics: Physics | None = None,
+        context: str = "hidden",
     ) -> None:
-        super().__init__({"n_objects": n_objects}, reward_type=reward_type, render_mode=render_mode, physics=physics)
+        variation = {"n_objects": n_objects}
+        super().__init__(variation, reward_type=reward_type, render_mode=render_mode, physics=physics, context=context)
 
 
 @with_sections(SECTIONS, id="PandaReach-v0", size="n_targets", things="targets")
@@ -103,8 +105,10 @@ class PandaReachEnv(PandaEnv):
         reward_type: str = "dense",
         render_mode: str | None = None,
         physics: Physics | None = None,
+        context: str = "hidden",
     ) -> None:
-        super().__init__({"n_targets": n_targets}, reward_type=reward_type, render_mode=render_mode, physics=physics)
+        variation = {"n_targets": n_targets}
+        super().__init__(variation, reward_type=reward_type, render_mode=render_mode, physics=physics, context=context)
 
 
 @with_sections(SECTIONS, id="PandaPush-v0", size="n_objects", things="blocks")

@@ -53,7 +53,7 @@ class PandaEnv(DomainEnv):
     variations: ClassVar[VariationSpace]
     #: A scripted controller that solves the task: from an observation ``(32,)`` to an action ``(4,)``, without memory.
     controller: ClassVar[Callable[[FlatObservation], Action]]
-    observation_names: ClassVar[tuple[str, ...]] = OBSERVATION_NAMES
+    observation_names: tuple[str, ...] = OBSERVATION_NAMES
     action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
 
     def __init__(
@@ -63,17 +63,21 @@ class PandaEnv(DomainEnv):
         reward_type: str = "dense",
         render_mode: str | None = None,
         physics: Physics | None = None,
+        context: str = "hidden",
     ) -> None:
         check_choice("reward_type", reward_type, ("dense", "sparse"))
         check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
-        super().__init__(variation, render_mode)
+        super().__init__(variation, self._observed_space(), render_mode, context)
         self.reward_type = reward_type
         self.action_space = spaces.Box(-1.0, 1.0, (len(ACTION_NAMES),), np.float32)
-        self.observation_space: spaces.Space[Any] = bounded_box(len(OBSERVATION_NAMES))
         self.task = self.task_class()
         self.scene = Scene(self.task.table, self.task.kind, physics, visual=render_mode is not None)
         self._camera = Camera(self.scene, self.task) if render_mode is not None else None
         self._approach_distance = 0.0
+
+    def _observed_space(self) -> spaces.Space[Any]:
+        """Return the space of observations, without the variation's numbers."""
+        return bounded_box(len(OBSERVATION_NAMES))
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Apply one action for 1/30 s.
@@ -119,7 +123,7 @@ class PandaEnv(DomainEnv):
             "previous_achieved_goal": achieved,
             "shaping": shaping,
         }
-        observation = self._observe()
+        observation = self._observation()
         return observation, self._reward(observation, info), info
 
     def plan(self) -> Iterator[Action]:
@@ -151,7 +155,7 @@ class PandaEnv(DomainEnv):
         given = {"starts": task.starts, "targets": task.targets, **start}
         task.place(self.scene, *task.read_start(len(task.targets), given["starts"], given["targets"]))
         self._update_focus()
-        return self._observe()
+        return self._observation()
 
     def render(self) -> Any:
         """Return a picture ``(360, 480, 3)`` of bytes, or show a window, as ``render_mode`` says."""

@@ -23,9 +23,8 @@ class PandaGoalEnv(PandaEnv, GoalEnv):
     It is a class of its own because SB3 takes everything that has a ``compute_reward`` for a goal environment.
     """
 
-    def __init__(self, *args: Any, **arguments: Any) -> None:
-        super().__init__(*args, **arguments)
-        self.observation_space = spaces.Dict(
+    def _observed_space(self) -> spaces.Space[Any]:
+        return spaces.Dict(
             OrderedDict(
                 observation=bounded_box(len(FEATURE_NAMES)),
                 achieved_goal=bounded_box(len(ACHIEVED_NAMES)),

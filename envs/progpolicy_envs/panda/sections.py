@@ -60,6 +60,7 @@ SECTIONS = {
         ## Arguments
         ``gym.make("$id", $size=5)`` or ``env.reset(options={"$size": 5})``; an option stays in force until it is
         changed. Values that are not accepted raise ``ValueError``.
+        ``context="observed"``, for ``gym.make``, adds the variation's numbers, from 0 to 1, to the end of observations.
 
         | Parameter   | Values              | Default   | Meaning                                                   |
         |-------------|---------------------|-----------|-----------------------------------------------------------|

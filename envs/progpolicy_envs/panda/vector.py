@@ -37,7 +37,7 @@ class PandaVectorEnv(DomainVectorEnv):
     }
     #: Makes one environment.
     make_single: ClassVar[EntryPoint]
-    observation_names: ClassVar[tuple[str, ...]] = PandaEnv.observation_names
+    observation_names: tuple[str, ...] = PandaEnv.observation_names
     action_names: ClassVar[tuple[str, ...]] = PandaEnv.action_names
 
     def __init_subclass__(cls) -> None:
@@ -60,6 +60,7 @@ class PandaVectorEnv(DomainVectorEnv):
                 self.envs.append(self.make_single(render_mode=render_mode, **arguments))
             first = self.envs[0]
             super().__init__(num_envs, first.observation_space, first.action_space, first.variation, max_episode_steps)
+            self.observation_names = first.observation_names
         except BaseException:
             self.close_extras()
             raise
