@@ -115,6 +115,7 @@ class TaskDistribution:
 
     #: Weight of the newest episodes in the running success rates.
     SUCCESS_SMOOTHING = 0.2
+    check = True  # of those saved by release 0.1
 
     def __init__(
         self,
