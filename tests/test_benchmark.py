@@ -449,7 +449,7 @@ def test_unknown_engine_and_jobs_are_refused(tmp_path):
 
 def test_methods_with_discrete_and_box_actions_run_on_both(tmp_path):
     pytest.importorskip("pybullet")
-    methods = {"sac": {"learning_starts": 32}, "hiro": {"learning_starts": 32, "high_learning_starts": 64}}
+    methods = {"sac": {"learning_starts": 32}, "hiro": {"learning_starts": 96, "high_learning_starts": 112}}
     domains = {env: {"n_timesteps": 160, "max_steps": 5} for env in ("Hanoi-v0", "PandaReach-v0")}
     suite = parse_suite({**SMALL, "methods": methods, "domains": domains, "seeds": [0]})
     for cell in suite.cells:

@@ -80,7 +80,7 @@ def test_run_folder_holds_model_program_and_what_was_run(trained):
     assert (config["algo"], config["env"], config["seed"]) == ("reptile_ppo", "Hanoi-v0", 0)
     assert config["hyperparams"]["n_steps"] == 16
     assert load_program(trained / "program.json").metadata["timesteps"] == 512
-    assert {row["timesteps"] for row in json.loads((trained / "evaluations.json").read_text())} == {0, 256}
+    assert {row["timesteps"] for row in json.loads((trained / "evaluations.json").read_text())} == {0, 256, 512}
 
 
 def test_equal_seeds_give_equal_programs_in_folders_of_their_own(trained):

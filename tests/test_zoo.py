@@ -49,7 +49,7 @@ def test_schedule_that_the_zoo_has_no_form_for_is_refused(monkeypatch):
 
 
 def test_algorithms_of_others_and_other_commands_are_refused():
-    with pytest.raises(ValueError, match="reptile_ppo"):
+    with pytest.raises(ValueError, match="unknown algorithm 'ppo'"):
         zoo_hyperparams("ppo")
     with pytest.raises(SystemExit, match=r"train\|enjoy"):
         main(["plot"])
