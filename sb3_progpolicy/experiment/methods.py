@@ -51,7 +51,7 @@ class Method:
 
         Such an algorithm makes its environments from an id, and its runs can be resumed.
         """
-        return issubclass(self.algorithm, ReptilePPO)
+        return hasattr(self.algorithm, "inner_loop")
 
     @property
     def takes_tasks(self) -> bool:
