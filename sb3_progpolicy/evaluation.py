@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from progpolicy_envs import DOMAINS
+from progpolicy_envs import find_domain
 from sb3_progpolicy.extraction import extract_program, holds_program, wrappers_of
 from sb3_progpolicy.interaction import VecInteractionHistory
 from sb3_progpolicy.nearest import unknown
@@ -229,7 +229,7 @@ def _evaluate(
     if cap is None or cap < 1:
         raise ValueError(f"max_steps={max_steps} is not accepted; {env_id} needs a cap on steps of at least 1")
     rows: list[Evaluation] = []
-    domain = DOMAINS.get(env_id.rpartition(":")[2])
+    domain = find_domain(env_id)
     # In a batch those that have finished go on until the last has, which is expensive where a step is a simulation.
     batched = spec.vector_entry_point is not None and not (domain is not None and domain.simulation)
     for group in _groups(variations, batched):

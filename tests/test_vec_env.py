@@ -12,6 +12,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, is_vecenv_wrapped
 
 from sb3_progpolicy.vec_env import BatchedVecEnv, GroupedSubprocVecEnv, GroupedVecEnv, make_fast_vec_env
+from sb3_progpolicy.vec_env.factory import simulations_in_this_process
 
 N_ENVS = 4
 
@@ -192,4 +193,15 @@ def test_no_process_is_started_where_none_may_be(monkeypatch):
     monkeypatch.setattr(multiprocessing.current_process(), "daemon", True)
     env = make_fast_vec_env("PandaReach-v0", 2)
     assert isinstance(env.unwrapped, BatchedVecEnv)
+    env.close()
+
+
+def test_no_process_is_started_within_simulations_in_this_process(monkeypatch):
+    set_cores(monkeypatch, 2)
+    with simulations_in_this_process():
+        env = make_fast_vec_env("PandaReach-v0", 2)
+        assert isinstance(env.unwrapped, BatchedVecEnv)
+        env.close()
+    env = make_fast_vec_env("PandaReach-v0", 2)
+    assert isinstance(env.unwrapped, GroupedVecEnv)
     env.close()

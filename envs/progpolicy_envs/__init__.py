@@ -8,7 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from progpolicy_envs.domains import DOMAINS, Domain, get_domain, register_domain
+from progpolicy_envs.domains import DOMAINS, Domain, find_domain, get_domain, register_domain
 
 MAX_EPISODE_STEPS = 500
 
@@ -37,4 +37,4 @@ def __getattr__(name: str) -> Any:
 
 register_envs()
 
-__all__ = ["DOMAINS", "Domain", "get_domain", "register_domain", "register_envs"]
+__all__ = ["DOMAINS", "Domain", "find_domain", "get_domain", "register_domain", "register_envs"]

@@ -167,17 +167,25 @@ DOMAINS: dict[str, Domain] = {
 }
 
 
+def find_domain(env_id: str | None) -> Domain | None:
+    """Return the domain of an environment id, ``None`` if it is of none.
+
+    :param env_id: with or without a module prefix; ``None`` where it is not known
+    """
+    return DOMAINS.get((env_id or "").rpartition(":")[2])
+
+
 def get_domain(env_id: str) -> Domain:
     """Return the domain of an environment id.
 
     :param env_id: such as ``"Hanoi-v0"``, with or without a module prefix (``"progpolicy_envs:Hanoi-v0"``)
     :raises ValueError: if this package has no such environment; the message names the nearest ids
     """
-    name = env_id.rpartition(":")[2]
-    if name not in DOMAINS:
-        near = get_close_matches(name, DOMAINS, n=3, cutoff=0.3) or list(DOMAINS)
+    domain = find_domain(env_id)
+    if domain is None:
+        near = get_close_matches(env_id.rpartition(":")[2], DOMAINS, n=3, cutoff=0.3) or list(DOMAINS)
         raise ValueError(f"{env_id!r} is not one of this package's environments; nearest: {', '.join(near)}")
-    return DOMAINS[name]
+    return domain
 
 
 def register_domain(

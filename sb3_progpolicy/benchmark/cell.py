@@ -25,6 +25,7 @@ from sb3_progpolicy.experiment.methods import METHODS
 from sb3_progpolicy.extraction import holds_program
 from sb3_progpolicy.programs.files import write_atomically
 from sb3_progpolicy.reptile.tasks import TaskDistribution
+from sb3_progpolicy.vec_env.factory import simulations_in_this_process
 
 #: Seed of the first training variation's evaluation; far from those of training.
 EVALUATION_SEED = 1_000_000
@@ -84,8 +85,9 @@ class _Notes(BaseCallback):
 def run_cell(cell: Cell, folder: Path) -> CellResult:
     """Train and evaluate a cell, or go on with one that was interrupted.
 
-    The result follows from the cell alone: it is the same on every engine, and after every interruption. Training goes
-    on from its last checkpoint where the method's runs can be resumed, and starts anew elsewhere.
+    It keeps to one core. The result follows from the cell alone: it is the same on every engine, and after every
+    interruption. Training goes on from its last checkpoint where the method's runs can be resumed, and starts anew
+    elsewhere.
 
     :param cell: what to do
     :param folder: of its run; made if it does not exist
@@ -93,7 +95,7 @@ def run_cell(cell: Cell, folder: Path) -> CellResult:
     """
     th.set_num_threads(1)
     folder.mkdir(parents=True, exist_ok=True)
-    with folders.locked(folder, wait=60):
+    with folders.locked(folder, wait=60), simulations_in_this_process():
         model = _train(cell, folder)
         started = time.monotonic()
         rows = _evaluate(cell, model)

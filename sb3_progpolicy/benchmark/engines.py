@@ -155,7 +155,8 @@ class RayEngine(Engine):
         except ModuleNotFoundError:
             raise ValueError('Ray is missing: pip install "sb3-progpolicy[ray]"') from None
         self._ray: Any = ray
-        if not ray.is_initialized():
+        self._started = not ray.is_initialized()
+        if self._started:
             own: dict[str, Any] = {} if address else {"num_cpus": jobs, "include_dashboard": False}
             try:
                 ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)
@@ -194,7 +195,8 @@ class RayEngine(Engine):
             self._ray.cancel(task, force=True)
         outcomes = [Outcome(key, error="interrupted", interrupted=True) for key in self._tasks.values()]
         self._tasks.clear()
-        self._ray.shutdown()
+        if self._started:
+            self._ray.shutdown()
         return outcomes
 
 

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 import html
 import io
-import json
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from matplotlib.figure import Figure
 
 from sb3_progpolicy.benchmark import figures, tables
+from sb3_progpolicy.benchmark.export import as_csv
 from sb3_progpolicy.benchmark.statistics import interquartile_mean
 from sb3_progpolicy.benchmark.tables import Row, label
 from sb3_progpolicy.programs.files import write_atomically
@@ -53,7 +51,7 @@ def write_report(name: str, cells: Sequence[Row], rows: Sequence[Row], folder: P
         write_atomically(folder / f"{title}.png", buffer.getvalue())
     write_atomically(folder / "table.md", f"# {name}\n\n{tables.markdown(rows)}")
     write_atomically(folder / "table.tex", tables.latex(rows))
-    write_atomically(folder / "table.csv", _csv(tables.table_rows(rows)))
+    write_atomically(folder / "table.csv", as_csv(tables.table_rows(rows)))
     page = folder / "index.html"
     write_atomically(page, _page(name, cells, rows, drawn))
     return page
@@ -75,15 +73,6 @@ def draw(cells: Sequence[Row], rows: Sequence[Row]) -> dict[str, Figure]:
         drawn[f"means_{env}"] = figures.means(scores, looks)
         drawn[f"profiles_{env}"] = figures.profiles(scores, looks)
     return drawn
-
-
-def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        writer.writerow({k: json.dumps(v, sort_keys=True) if isinstance(v, dict) else v for k, v in row.items()})
-    return buffer.getvalue()
 
 
 def _page(name: str, cells: Sequence[Row], rows: Sequence[Row], drawn: Mapping[str, Figure]) -> str:
@@ -117,11 +106,7 @@ def _page(name: str, cells: Sequence[Row], rows: Sequence[Row], drawn: Mapping[s
 
 def _table(rows: Sequence[Row]) -> str:
     found = tables.entries(rows)
-    columns = list(dict.fromkeys((entry.set, label(entry.env, entry.variation)) for entry in found))
-    least = {
-        column: min(entry.mean for entry in found if (entry.set, label(entry.env, entry.variation)) == column)
-        for column in columns
-    }
+    columns, least = tables.columns_of(found), tables.best_steps(found)
     heads = "".join(f'<th class="{part}">{html.escape(text)}{"*" * (part == "unseen")}</th>' for part, text in columns)
     lines = [f"<tr><th>method</th><th>seeds</th>{heads}</tr>"]
     for method in dict.fromkeys(entry.method for entry in found):
@@ -132,7 +117,7 @@ def _table(rows: Sequence[Row]) -> str:
             if entry is None:
                 texts.append("<td></td>")
                 continue
-            best = " best" if entry.success > 0 and entry.mean <= 1.02 * least[column] else ""
+            best = " best" if tables.is_best(entry, least) else ""
             ratio = "" if entry.ratio is None else f" <small>{entry.ratio:.2f}</small>"
             ratio = ratio if entry.success == 1 else f" <small>[{entry.success:.0%}]</small>"
             trained = "°" if entry.relation == "trained" else ""

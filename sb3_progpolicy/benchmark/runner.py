@@ -14,6 +14,8 @@ from sb3_progpolicy.benchmark.suite import Cell, Suite
 
 #: Seconds between two signs of life.
 LIFE = 20.0
+#: Seconds between two looks at what other runners do.
+LOOK = 1.0
 
 
 @dataclass
@@ -72,7 +74,6 @@ def run_suite(
     source: str,
     report: Callable[[Progress], None] = lambda progress: None,
     selected: Sequence[Cell] | None = None,
-    wait: float = 1.0,
 ) -> Progress:
     """Run the cells of a suite that are not done yet.
 
@@ -85,7 +86,6 @@ def run_suite(
     :param source: the suite's file, as it stands in the command that reproduces a cell
     :param report: is called about once a second
     :param selected: those of the suite's cells that are to be run; all by default
-    :param wait: seconds between two looks at what other runners do
     :return: where it stands in the end
     """
     cells = {cell.key: cell for cell in (suite.cells if selected is None else selected)}
@@ -110,7 +110,7 @@ def run_suite(
             for key in engine.running:
                 progress.running[key] = (progress.running[key][0], engine.timesteps(key))
             report(progress)
-            for outcome in engine.wait(wait):
+            for outcome in engine.wait(LOOK):
                 _keep(outcome, store, progress, attempts)
             if time.monotonic() - last_sign >= LIFE:
                 last_sign = time.monotonic()

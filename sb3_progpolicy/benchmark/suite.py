@@ -149,7 +149,7 @@ def _setting(name: str, value: Any) -> Any:
         if not isinstance(value, str):
             raise ValueError(f"device={shortened(value)} is not accepted; it is a text")
         return value
-    least = {"max_minutes": 0.0, "curve_points": 0}.get(name, 1)
+    least = {"max_minutes": 0.01, "curve_points": 0}.get(name, 1)
     if value is None and SETTINGS[name] is None:
         return None
     whole = name != "max_minutes"

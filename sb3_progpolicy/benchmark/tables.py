@@ -104,28 +104,27 @@ def label(env: str, variation: Mapping[str, Any]) -> str:
     return " ".join([str(variation[size]), *others])
 
 
-def _columns(found: Sequence[Entry]) -> list[tuple[str, str]]:
+def columns_of(found: Sequence[Entry]) -> list[tuple[str, str]]:
     """Return set and label of a domain's variations, in order."""
     return list(dict.fromkeys((entry.set, label(entry.env, entry.variation)) for entry in found))
 
 
-def markdown(rows: Sequence[Row], planner: bool = True) -> str:
+def markdown(rows: Sequence[Row]) -> str:
     """Return a table for each domain.
 
     :param rows: of a store
-    :param planner: whether to give the ratio to the planner's steps, too
     """
     found, lines = entries(rows), []
     for env in dict.fromkeys(entry.env for entry in found):
         own = [entry for entry in found if entry.env == env]
-        columns = _columns(own)
+        columns = columns_of(own)
         lines += [f"### {env}", "", f"Steps by {get_domain(env).size}, mean ± standard deviation over seeds.", ""]
         lines.append("| method | seeds | " + " | ".join(f"{name}{_mark(part)}" for part, name in columns) + " |")
         lines.append("|---|---:|" + "---:|" * len(columns))
-        best = _best(own)
+        best = best_steps(own)
         for method in dict.fromkeys(entry.method for entry in own):
             cells = {(e.set, label(env, e.variation)): e for e in own if e.method == method}
-            texts = [_text(cells.get(column), best, planner) for column in columns]
+            texts = [_text(cells.get(column), best) for column in columns]
             seeds = max(entry.seeds for entry in cells.values())
             capped = "†" if any(entry.capped for entry in cells.values()) else ""
             lines.append(f"| {method}{capped} | {seeds} | {' | '.join(texts)} |")
@@ -145,7 +144,11 @@ def _mark(part: str) -> str:
     return "\\*" if part == "unseen" else ""
 
 
-def _best(found: Sequence[Entry]) -> dict[tuple[str, str], float]:
+def best_steps(found: Sequence[Entry]) -> dict[tuple[str, str], float]:
+    """Return the fewest steps of each column, by set and label.
+
+    :param found: entries of one domain
+    """
     best: dict[tuple[str, str], float] = {}
     for entry in found:
         column = (entry.set, label(entry.env, entry.variation))
@@ -153,19 +156,24 @@ def _best(found: Sequence[Entry]) -> dict[tuple[str, str], float]:
     return best
 
 
-def _is_best(entry: Entry, best: Mapping[tuple[str, str], float]) -> bool:
+def is_best(entry: Entry, best: Mapping[tuple[str, str], float]) -> bool:
+    """Return whether an entry solves something and takes at most 2 % more steps than the best of its column.
+
+    :param entry: of the table
+    :param best: of :func:`best_steps`
+    """
     return entry.success > 0 and entry.mean <= 1.02 * best[entry.set, label(entry.env, entry.variation)]
 
 
-def _text(entry: Entry | None, best: Mapping[tuple[str, str], float], planner: bool) -> str:
+def _text(entry: Entry | None, best: Mapping[tuple[str, str], float]) -> str:
     if entry is None:
         return ""
     text = f"{entry.mean:.0f} ± {entry.std:.0f}"
     if entry.success < 1:
         text += f" [{entry.success:.0%}]"
-    elif planner and entry.ratio is not None:
+    elif entry.ratio is not None:
         text += f" ({entry.ratio:.2f})"
-    if _is_best(entry, best):
+    if is_best(entry, best):
         text = f"**{text}**"
     return text + ("°" if entry.relation == "trained" else "")
 
@@ -178,7 +186,7 @@ def latex(rows: Sequence[Row]) -> str:
     found, lines = entries(rows), ["% \\usepackage{booktabs}"]
     for env in dict.fromkeys(entry.env for entry in found):
         own = [entry for entry in found if entry.env == env]
-        columns, best = _columns(own), _best(own)
+        columns, best = columns_of(own), best_steps(own)
         lines += [f"% {env}", f"\\begin{{tabular}}{{l{'r' * len(columns)}}}", "\\toprule"]
         heads = [f"{_escaped(name)}{'$^*$' if part == 'unseen' else ''}" for part, name in columns]
         lines += [" & ".join(["method", *heads]) + " \\\\", "\\midrule"]
@@ -188,7 +196,7 @@ def latex(rows: Sequence[Row]) -> str:
             for column in columns:
                 entry = cells.get(column)
                 text = "" if entry is None else f"${entry.mean:.0f} \\pm {entry.std:.0f}$"
-                bold = entry is not None and _is_best(entry, best)
+                bold = entry is not None and is_best(entry, best)
                 texts.append(f"\\boldmath{text}" if bold else text)
             capped = "$^\\dagger$" if any(entry.capped for entry in cells.values()) else ""
             lines.append(" & ".join([_escaped(method) + capped, *texts]) + " \\\\")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import time
 from collections.abc import Callable
@@ -52,7 +50,7 @@ def run(
     loaded = load_suite(suite)
     selected = _selected(loaded, {"method": method, "env": env, "seed": seed})
     with open_store(store) as opened, terminable():
-        folder = runs or Path(f"{store.rpartition('/')[2] if '://' in store else store}.runs")
+        folder = runs or _beside(store)
         with _Display(jobs) as display:
             made = make_engine(engine, jobs, folder, ray_address)
             progress = run_suite(loaded, opened, made, str(suite), display.show, selected)
@@ -87,51 +85,28 @@ def status(store: Annotated[str, typer.Argument(help="SQLite file or database UR
 def export(
     store: Annotated[str, typer.Argument(help="SQLite file or database URL")],
     as_json: Annotated[bool, typer.Option("--json", help="as a JSON list")] = False,
-    as_csv: Annotated[bool, typer.Option("--csv", help="as CSV, the default")] = False,
+    csv: Annotated[bool, typer.Option("--csv", help="as CSV, the default")] = False,
     curves: Annotated[bool, typer.Option("--curves", help="the training curves instead of the rows")] = False,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="file; by default standard output")] = None,
     suite: ONE_SUITE = None,
 ) -> None:
     """Print the rows of a suite: one for each cell, variation and, where there is a program, semantics."""
+    from sb3_progpolicy.benchmark.export import as_csv, curve_rows
     from sb3_progpolicy.benchmark.store import open_store
 
-    if as_json and as_csv:
+    if as_json and csv:
         raise ValueError("--json and --csv are not accepted together")
     if output is not None:
         check_folder(output)
     with open_store(store, create=False) as opened:
         rows = curve_rows(opened.cells(suite)) if curves else opened.rows(suite)
-    text = json.dumps(rows, indent=1) + "\n" if as_json else as_csv_text(rows)
+    text = json.dumps(rows, indent=1) + "\n" if as_json else as_csv(rows)
     if output is None:
         typer.echo(text, nl=False)
         return
     from sb3_progpolicy.programs.files import write_atomically
 
     write_atomically(output, text)
-
-
-def curve_rows(cells: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the training curves of cells as rows.
-
-    :param cells: of :meth:`~sb3_progpolicy.benchmark.store.Store.cells`
-    """
-    names = ("timesteps", "variation", "success_rate", "steps_mean", "steps_std", "optimal_steps_mean")
-    return [
-        {"method": cell["method"], "env": cell["env"], "seed": cell["seed"], **{name: point[name] for name in names}}
-        for cell in cells
-        if cell["result"] is not None
-        for point in cell["result"]["curve"]
-    ]
-
-
-def as_csv_text(rows: list[dict[str, Any]]) -> str:
-    """Return rows as CSV; mappings are written as JSON, ``None`` as nothing."""
-    buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, list(rows[0]) if rows else [], lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        writer.writerow({k: json.dumps(v, sort_keys=True) if isinstance(v, dict) else v for k, v in row.items()})
-    return buffer.getvalue()
 
 
 def report(
@@ -151,6 +126,12 @@ def report(
 
 
 COMMANDS: dict[str, Callable[..., None]] = {"run": run, "status": status, "export": export, "report": report}
+
+
+def _beside(store: str) -> Path:
+    """Return the folder of the runs beside an SQLite file; for another database it is named after that, and here."""
+    path = store.removeprefix("sqlite:///")
+    return Path(f"{path.rpartition('/')[2] if '://' in path else path}.runs")
 
 
 def _selected(suite: Suite, wanted: dict[str, Any]) -> list[Any]:
@@ -204,7 +185,7 @@ class _Display:
             for cell in progress.cells:
                 if cell.key in getattr(progress, kind) and cell.key not in self._said:
                     self._said.add(cell.key)
-                    if len(self._said) and not self.console.is_terminal:
+                    if not self.console.is_terminal:
                         count = f"{len(progress.done) + len(progress.failed)}/{len(progress.cells)}"
                         self.console.print(f"{count} {cell.name}: {kind}", highlight=False, soft_wrap=True)
 

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from sb3_progpolicy.cli.parsing import ALLOW_PICKLE, default_variations, parse_variations
 from sb3_progpolicy.cli.streams import quiet_stdout
-from sb3_progpolicy.experiment.sources import Source, find_source
+from sb3_progpolicy.experiment.sources import Source, evaluate_source, find_source
 from sb3_progpolicy.nearest import unknown
 
 if TYPE_CHECKING:
     from sb3_progpolicy.evaluation import Evaluation
+    from sb3_progpolicy.programs.interpreter import Semantics
 
-SEMANTICS = ("soft", "crisp")
+SEMANTICS: tuple[Semantics, ...] = ("soft", "crisp")
 
 
 def evaluate(
@@ -59,24 +60,13 @@ def _evaluate(
 ) -> list[Evaluation]:
     import torch
 
-    from sb3_progpolicy.evaluation import evaluate_model, evaluate_program
-
     torch.set_num_threads(1)
     env_id = env or source.env_id
     if env_id is None:
         raise ValueError(f"{source.name} does not say which environment it is for; give --env")
     chosen = parse_variations(pairs) if pairs else default_variations(env_id)
-    common: dict[str, Any] = {"seed": seed, "max_steps": max_steps, "env_kwargs": source.env_kwargs}
-    if source.program is None:
-        assert source.model is not None
-        return evaluate_model(source.model, env_id, chosen, episodes, **common)
-    program = source.program
-    return [
-        row
-        for kind in SEMANTICS
-        if semantics in (kind, "both")
-        for row in evaluate_program(program, env_id, chosen, episodes, kind, **common)  # type: ignore[arg-type]
-    ]
+    kinds = [kind for kind in SEMANTICS if semantics in (kind, "both")]
+    return evaluate_source(source, chosen, episodes, kinds, env_id, seed=seed, max_steps=max_steps)
 
 
 def _print_table(rows: list[Evaluation]) -> None:

@@ -8,7 +8,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from progpolicy_envs import DOMAINS
+from progpolicy_envs import find_domain
 from sb3_progpolicy.hyperparams import parse_kwargs, parse_value, shortened
 
 # Flags that, as in the zoo, take several values: `--hyperparams n_steps:64 gamma:0.9`.
@@ -107,7 +107,7 @@ def check_folder(output: Path) -> None:
 
 def default_variations(env_id: str) -> list[dict[str, Any]]:
     """Return a domain's training sizes and all larger variations, or the environment as it is for any other id."""
-    domain = DOMAINS.get(env_id.rpartition(":")[2])
+    domain = find_domain(env_id)
     if domain is None:
         return [{}]
     sizes = [{domain.size: size} for size in dict.fromkeys(variation[domain.size] for variation in domain.train)]

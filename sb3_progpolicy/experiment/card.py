@@ -8,35 +8,15 @@ from typing import Any
 
 import yaml
 
-from progpolicy_envs import DOMAINS
-from sb3_progpolicy.evaluation import Evaluation, evaluate_model, evaluate_program
+from progpolicy_envs import find_domain
+from sb3_progpolicy.evaluation import Evaluation
 from sb3_progpolicy.experiment.film import record
 from sb3_progpolicy.experiment.folder import CONFIG, VERSIONS, read_config, timesteps_of
 from sb3_progpolicy.experiment.methods import METHODS
-from sb3_progpolicy.experiment.sources import Source
+from sb3_progpolicy.experiment.sources import Source, evaluate_source
 from sb3_progpolicy.hyperparams import read_yaml
 from sb3_progpolicy.programs import export_text
 from sb3_progpolicy.programs.files import write_atomically
-
-
-def evaluate_source(
-    source: Source, variations: Sequence[Mapping[str, Any]], n_episodes: int, seed: int = 0
-) -> list[Evaluation]:
-    """Run what a name stands for on variations: a program crisp, as it is read, or a model.
-
-    :param source: from :func:`~sb3_progpolicy.experiment.sources.find_source`
-    :param variations: one for each row of the result
-    :param n_episodes: on each
-    :param seed: of the environments
-    :raises ValueError: if the environment is not known
-    """
-    if source.env_id is None:
-        raise ValueError(f"{source.name} does not say which environment it is for")
-    common: dict[str, Any] = {"seed": seed, "env_kwargs": source.env_kwargs}
-    if source.program is not None:
-        return evaluate_program(source.program, source.env_id, variations, n_episodes, "crisp", **common)
-    assert source.model is not None
-    return evaluate_model(source.model, source.env_id, variations, n_episodes, **common)
 
 
 def write_card(
@@ -92,7 +72,7 @@ def _training(source: Source, folder: Path | None) -> list[str]:
         f"* Steps: {'unknown' if steps is None else steps} of {config.n_timesteps}",
         f"* Seed: {config.seed}",
     ]
-    domain = DOMAINS.get(config.env.rpartition(":")[2])
+    domain = find_domain(config.env)
     tasks = config.hyperparams.get("tasks")
     if tasks is not None:
         lines.append(f"* Trained on: {tasks}")
@@ -116,7 +96,7 @@ def _training(source: Source, folder: Path | None) -> list[str]:
 
 
 def _table(source: Source, rows: Sequence[Evaluation], n_episodes: int) -> list[str]:
-    domain = DOMAINS.get((source.env_id or "").rpartition(":")[2])
+    domain = find_domain(source.env_id)
     lines = [
         "## Results",
         "",

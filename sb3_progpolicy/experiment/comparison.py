@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from sb3_progpolicy.evaluation import Evaluation
-from sb3_progpolicy.experiment.card import evaluate_source
 from sb3_progpolicy.experiment.folder import EVALUATIONS
-from sb3_progpolicy.experiment.sources import Source
+from sb3_progpolicy.experiment.sources import Source, evaluate_source
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ def compare_sources(
         listed = ", ".join(f"{source.name}: {source.env_id}" for source in sources)
         raise ValueError(f"runs of different environments cannot be compared: {listed}")
     return [
-        Compared(source.name, evaluate_source(source, variations, n_episodes, seed), read_curve(Path(source.name)))
+        Compared(source.name, evaluate_source(source, variations, n_episodes, seed=seed), read_curve(Path(source.name)))
         for source in sources
     ]
 

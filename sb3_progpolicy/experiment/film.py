@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from sb3_progpolicy.experiment.sources import Source, find_source
+from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.programs.files import write_atomically
 
 LAST_FRAME_SECONDS = 2.0
+ACTORS = ("policy", "planner", "random")
 
 
 def record(
@@ -43,6 +45,8 @@ def record(
 
     if output.suffix.lower() not in FORMATS:
         raise ValueError(f"-o {str(output)!r} is not accepted; the file is a .gif or an .mp4")
+    if actor not in ACTORS:
+        raise unknown("actor", actor, ACTORS)
     if source.env_id is None:
         raise ValueError(f"{source.name} does not say which environment it is for")
     cap = max_steps or spec_of(source.env_id).max_episode_steps
@@ -52,7 +56,7 @@ def record(
     try:
         observation, info = env.reset(seed=seed, options=dict(variation))
         env.action_space.seed(seed)
-        act = {"planner": _planner, "random": _random}[actor](env) if actor != "policy" else _policy(source, semantics)
+        act = _planner(env) if actor == "planner" else _random(env) if actor == "random" else _policy(source, semantics)
         with FORMATS[output.suffix.lower()](fps or env.metadata.get("render_fps", 4)) as frames:
             steps, success = _play(env, act, observation, info.get("optimal_steps"), cap, frames.add)
             write_atomically(output, frames.content())

@@ -61,7 +61,9 @@ def describe_run(folder: Path, config: RunConfig, arguments: Mapping[str, Any]) 
     :param config: what is run
     :param arguments: the command line's options
     """
-    for file, content in {VERSIONS: versions(), ARGUMENTS: dict(arguments), CONFIG: asdict(config)}.items():
+    if not (folder / VERSIONS).is_file():  # those that it was begun with
+        write_atomically(folder / VERSIONS, yaml.safe_dump(versions(), sort_keys=False))
+    for file, content in {ARGUMENTS: dict(arguments), CONFIG: asdict(config)}.items():
         write_atomically(folder / file, yaml.safe_dump(content, sort_keys=False))
 
 

@@ -16,7 +16,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from progpolicy_envs import DOMAINS
+from progpolicy_envs import find_domain
 from sb3_progpolicy.evaluation import evaluate_any
 from sb3_progpolicy.experiment.config import REPTILE, RunConfig, check_surroundings, parse_schedule
 from sb3_progpolicy.experiment.folder import (
@@ -272,7 +272,7 @@ class _EvaluateVariations(BaseCallback):
         super().__init__()
         self.config, self.options, self.path, self.wrapper = config, options, path, wrapper
         self._meta_iteration: int | None = None
-        domain = DOMAINS.get(config.env.rpartition(":")[2])
+        domain = find_domain(config.env)
         self.variations = [{}] if domain is None else list(domain.validation)
         self._next = 0
         self._kept: list[dict[str, Any]] = []

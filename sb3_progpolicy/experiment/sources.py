@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.pretrained import load_pretrained, pretrained_names
+from sb3_progpolicy.programs.interpreter import Semantics
 from sb3_progpolicy.programs.program import Program, load_program
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
+
+    from sb3_progpolicy.evaluation import Evaluation
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,40 @@ def find_source(name: str, allow_pickle: bool = False) -> Source:
     if name.rpartition(":")[2] in pretrained_names():
         return _from_program(name, load_pretrained(name))
     raise unknown("run, file or pretrained program", name, pretrained_names())
+
+
+def evaluate_source(
+    source: Source,
+    variations: Sequence[Mapping[str, Any]],
+    n_episodes: int,
+    semantics: Sequence[Semantics] = ("crisp",),
+    env_id: str | None = None,
+    **arguments: Any,
+) -> list[Evaluation]:
+    """Run what a name stands for on variations: a program in each of the semantics, or a model.
+
+    :param source: from :func:`find_source`
+    :param variations: one for each row of the result
+    :param n_episodes: on each
+    :param semantics: of a program; crisp is how it is read
+    :param env_id: in place of the environment that it was trained in
+    :param arguments: further ones of :func:`~sb3_progpolicy.evaluate_program`
+    :raises ValueError: if the environment is not known
+    """
+    from sb3_progpolicy.evaluation import evaluate_model, evaluate_program
+
+    env_id = env_id or source.env_id
+    if env_id is None:
+        raise ValueError(f"{source.name} does not say which environment it is for; give --env")
+    common: dict[str, Any] = {"env_kwargs": source.env_kwargs, **arguments}
+    if source.program is None:
+        assert source.model is not None
+        return evaluate_model(source.model, env_id, variations, n_episodes, **common)
+    return [
+        row
+        for kind in semantics
+        for row in evaluate_program(source.program, env_id, variations, n_episodes, kind, **common)
+    ]
 
 
 def _from_program(name: str, program: Program, env_kwargs: dict[str, Any] | None = None) -> Source:

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from progpolicy_envs import Domain, get_domain
-from sb3_progpolicy.evaluation import Evaluation, evaluate_any
+from sb3_progpolicy.evaluation import Evaluation, evaluate_any, spec_of
 from sb3_progpolicy.experiment.budget import ProcessorTimeLimit
 from sb3_progpolicy.experiment.config import RunConfig, make_config
 from sb3_progpolicy.experiment.run import build_model
 from sb3_progpolicy.hyperparams import load_search, shortened
-from sb3_progpolicy.nearest import unknown
+from sb3_progpolicy.vec_env.factory import simulations_in_this_process
 
 if TYPE_CHECKING:
     from optuna import Study, Trial
@@ -164,20 +164,18 @@ def run_trial(tuning: Tuning, trial: Trial) -> float:
         trial.set_user_attr("diverged", str(error))
         return 1.0
     variations = [*domain.trained, *domain.validation]
-    rows = evaluate_any(model, tuning.env, variations, tuning.episodes, semantics=("crisp",))
+    rows = evaluate_any(
+        model, tuning.env, variations, tuning.episodes, semantics=("crisp",), env_kwargs=config.env_kwargs
+    )
     trial.set_user_attr("timesteps", model.num_timesteps)
     trial.set_user_attr("capped", limit is not None and limit.reached)
     trial.set_user_attr("steps_mean", [row.steps_mean for row in rows])
     env = model.get_env()
     if env is not None:
         env.close()
-    return score(domain, rows, _cap(tuning.env))
-
-
-def _cap(env_id: str) -> int:
-    from sb3_progpolicy.evaluation import spec_of
-
-    return spec_of(env_id).max_episode_steps or 500
+    cap = spec_of(tuning.env).max_episode_steps
+    assert cap is not None, "evaluation needs one"
+    return score(domain, rows, cap)
 
 
 def open_study(tuning: Tuning, storage: str | None, name: str | None = None) -> Study:
@@ -231,19 +229,9 @@ def tune(tuning: Tuning, study: Study, report: Callable[[FrozenTrial], None] | N
     :param report: is called with each trial that has ended
     """
     while len(finished(study)) < tuning.n_trials:
-        study.optimize(
-            lambda trial: run_trial(tuning, trial),
-            n_trials=1,
-            callbacks=[] if report is None else [lambda _, trial: report(trial)],
-        )
-
-
-def best_hyperparams(study: Study) -> dict[str, Any]:
-    """Return what the best trial had in place of the file's hyperparameters.
-
-    :raises ValueError: if no trial has a score yet
-    """
-    chosen = study.best_trial.user_attrs["hyperparams"]
-    if not isinstance(chosen, dict):
-        raise unknown("hyperparameters", str(chosen), ["a mapping"])
-    return chosen
+        with simulations_in_this_process():  # whose time would not count towards the limit elsewhere
+            study.optimize(
+                lambda trial: run_trial(tuning, trial),
+                n_trials=1,
+                callbacks=[] if report is None else [lambda _, trial: report(trial)],
+            )

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from progpolicy_envs import DOMAINS
+from progpolicy_envs import find_domain
 
 Variation = dict[str, Any]
 Draw = Callable[[np.random.Generator], Any]
@@ -325,7 +325,7 @@ def default_tasks(env_id: str | None) -> TaskDistribution:
 
     :param env_id: environment id; ``None`` where it is not known
     """
-    domain = DOMAINS.get((env_id or "").rpartition(":")[2])
+    domain = find_domain(env_id)
     return TaskDistribution([{}]) if domain is None else TaskDistribution(domain.train)
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextvars import ContextVar
 from functools import partial
 from importlib import import_module
 from typing import Any
@@ -12,15 +14,28 @@ import gymnasium as gym
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
-from progpolicy_envs import DOMAINS
+from progpolicy_envs import find_domain
 from sb3_progpolicy.vec_env.batched import BatchedVecEnv
 from sb3_progpolicy.vec_env.grouped import GroupedSubprocVecEnv, GroupedVecEnv, even_shares, usable_cores
+
+_IN_THIS_PROCESS: ContextVar[bool] = ContextVar("in_this_process", default=False)
+
+
+@contextlib.contextmanager
+def simulations_in_this_process() -> Iterator[None]:
+    """Let :func:`make_fast_vec_env` start no processes, so that a training keeps to one core."""
+    token = _IN_THIS_PROCESS.set(True)
+    try:
+        yield
+    finally:
+        _IN_THIS_PROCESS.reset(token)
 
 
 def make_fast_vec_env(env_id: str, n_envs: int, seed: int | None = None, **env_kwargs: Any) -> VecEnv:
     """Build the fastest vectorised environment of an id, monitored.
 
-    * The Panda tasks run in as many processes as there are cores, with one batch in each.
+    * The Panda tasks run in as many processes as there are cores, with one batch in each; in this one alone within
+      :func:`simulations_in_this_process`.
     * Their goal form (``observation="goal"``) runs in as many processes, with single environments in each. A replay
       buffer needs the infos of every step, and a batch gives only those of the steps that end an episode.
     * Other ids run in this process: as one batch if they have a form that resets within the step and no picture is
@@ -38,9 +53,10 @@ def make_fast_vec_env(env_id: str, n_envs: int, seed: int | None = None, **env_k
     module, _, name = env_id.rpartition(":")
     if module:
         import_module(module)  # registers the id; gym.spec does not know the prefix
-    simulation = name in DOMAINS and DOMAINS[name].simulation
+    domain = find_domain(name)
+    simulation = domain is not None and domain.simulation
     # A daemonic process, such as one of a multiprocessing.Pool, may not start others.
-    may_start = simulation and not multiprocessing.current_process().daemon
+    may_start = simulation and not (multiprocessing.current_process().daemon or _IN_THIS_PROCESS.get())
     n_processes = min(n_envs, usable_cores()) if may_start else 1
     venv: VecEnv | None = None
     if gym.spec(name).vector_entry_point is not None and _batch_suffices(simulation, env_kwargs):
