@@ -21,6 +21,7 @@ class EpisodeStatistics:
 
     def __init__(self, tasks: TaskDistribution) -> None:
         self.tasks = tasks
+        self.recorded: list[tuple[int, float]] = []  # index of a variation and its success rate, as told to the tasks
         self._successes: dict[int, list[float]] = defaultdict(list)
         self._lengths: dict[int, list[float]] = defaultdict(list)
 
@@ -43,8 +44,10 @@ class EpisodeStatistics:
         :param logger: of the model
         """
         for index, successes in self._successes.items():
-            self.tasks.record(index, float(np.mean(successes)))
-            logger.record(f"success/{self.tasks.label(index)}", float(np.mean(successes)))
+            rate = float(np.mean(successes))
+            self.recorded.append((index, rate))
+            self.tasks.record(index, rate)
+            logger.record(f"success/{self.tasks.label(index)}", rate)
         for index, lengths in self._lengths.items():
             logger.record(f"steps/{self.tasks.label(index)}", float(np.mean(lengths)))
         self._successes.clear()

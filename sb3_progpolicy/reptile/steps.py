@@ -42,6 +42,7 @@ def begin_task(
     progress: float,
     seed: int | None,
     rng: np.random.Generator,
+    replica: int = 0,
 ) -> tuple[list[th.Tensor], Task, np.random.Generator]:
     """Draw the tasks of a meta-iteration and note the parameters on which it starts (line 4).
 
@@ -55,11 +56,12 @@ def begin_task(
     :param progress: of the training, from 0 to 1
     :param seed: of the training; ``None`` draws from ``rng``
     :param rng: source of randomness where there is no seed
+    :param replica: which of the inner loops of a meta-batch this is for, from 0
     :return: theta, a copy of the parameters; the task; the generator for all that is random in it
     """
     task_seed = None
     if seed is not None:
-        first, second = np.random.SeedSequence([seed, number]).generate_state(2)
+        first, second = np.random.SeedSequence([seed, number, replica]).generate_state(2)
         task_seed, rng = int(first >> 1), np.random.default_rng(int(second))
     n_tasks = min(n_tasks, n_envs)
     drawn = tasks.sample(rng, progress, n_tasks)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
-import pathlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
@@ -13,7 +11,7 @@ import torch as th
 from sb3_contrib.ppo_recurrent import MlpLstmPolicy
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_progpolicy.extraction import env_id_of, extract_program, wrappers_of
@@ -27,9 +25,15 @@ from sb3_progpolicy.reptile.statistics import EpisodeStatistics
 from sb3_progpolicy.reptile.steps import MetaOptimizer, MetaOptimizerName, Task, begin_task
 from sb3_progpolicy.reptile.tasks import TaskDistribution, default_tasks
 from sb3_progpolicy.reptile_ppo.environments import make_venv, with_history
-from sb3_progpolicy.reptile_ppo.loading import load_model, parameters_of
-from sb3_progpolicy.reptile_ppo.saving import print_versions, write_model
-from sb3_progpolicy.reptile_ppo.sequence_ppo import SequencePPO, largest_divisor
+from sb3_progpolicy.reptile_ppo.inner_loops import (
+    EngineName,
+    InnerLoops,
+    check_batch_arguments,
+    mean_of,
+    open_inner_loops,
+)
+from sb3_progpolicy.reptile_ppo.sequence_ppo import default_batch_size
+from sb3_progpolicy.reptile_ppo.stored_ppo import StoredPPO
 from sb3_progpolicy.reptile_ppo.theta import Theta
 
 SelfReptilePPO = TypeVar("SelfReptilePPO", bound="ReptilePPO")
@@ -41,11 +45,12 @@ class _Learning:
 
     callback: BaseCallback
     log_interval: int | None = None
+    inner_loops: InnerLoops | None = None
     n_rollouts: int = 0
     stopped: bool = False
 
 
-class ReptilePPO(SequencePPO):
+class ReptilePPO(StoredPPO):
     """Reptile + PPO across the variations of a task domain, learning a program (algorithm 1).
 
     .. code-block:: python
@@ -89,6 +94,12 @@ class ReptilePPO(SequencePPO):
     :param tasks_per_iteration: tasks of a meta-iteration, dealt out over the environments; see :class:`ReptileWrapper`
     :param meta_learning_rate: beta, a number or a schedule
     :param meta_optimizer: ``"sgd"`` or ``"adam"``
+    :param meta_batch_size: inner loops of a meta-iteration. Each has tasks of its own and starts from the same theta,
+        which then takes a step towards the mean of their results (Reptile's batched form; Nichol and Schulman, 2018,
+        section 3). Callbacks then hear of a meta-iteration's steps when it is over, and not of single rewards or infos
+    :param engine: where the inner loops of a meta-batch are made, with the same outcome: ``"local"``, in processes of
+        this machine; ``"ray"``, on a cluster; ``"serial"``, one after another in this process. The first two need an
+        environment id
     :param meta_update: ``False`` for PPO-N: tasks change, the meta-step is left out
     :param search_fraction: share of the steps, 0 to 1, after which the program is extracted
     :param length_coef: price on the expected number of conditions, at least 0; the higher, the shorter the programs
@@ -141,6 +152,8 @@ class ReptilePPO(SequencePPO):
         tasks_per_iteration: int = 4,
         meta_learning_rate: float | Schedule = 0.5,
         meta_optimizer: MetaOptimizerName = "sgd",
+        meta_batch_size: int = 1,
+        engine: EngineName = "local",
         meta_update: bool = True,
         search_fraction: float = 0.5,
         length_coef: float = 0.005,
@@ -160,6 +173,9 @@ class ReptilePPO(SequencePPO):
         if not 0 <= search_fraction <= 1:
             raise ValueError(f"search_fraction={search_fraction} is not accepted; it is from 0 to 1")
         check_reptile_arguments(inner_updates, tasks_per_iteration)
+        check_batch_arguments(meta_batch_size, engine)
+        self.meta_batch_size, self.engine = meta_batch_size, engine
+        self.env_by_id = isinstance(env, str)
         self.env_id = env if isinstance(env, str) else env_id_of(env)
         self.interaction_history = interaction_history
         self.env_kwargs = dict(env_kwargs or {})
@@ -167,7 +183,7 @@ class ReptilePPO(SequencePPO):
         if env is not None:
             venv = with_history(make_venv(env, n_envs, seed, env_kwargs or {}), interaction_history)
         if batch_size is None:
-            batch_size = _default_batch_size(n_steps, 1 if venv is None else venv.num_envs)
+            batch_size = default_batch_size(n_steps, 1 if venv is None else venv.num_envs)
         policy_class = self._get_policy_from_name(policy) if isinstance(policy, str) else policy
         if learning_rate is None:
             learning_rate = 1e-2 if issubclass(policy_class, ProgrammaticActorCritic) else 3e-4
@@ -242,31 +258,26 @@ class ReptilePPO(SequencePPO):
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
         self._update_current_progress_remaining(self.num_timesteps, max(1, total_timesteps))
-        learning = _Learning(callback, log_interval)
         check_variations(self.tasks, self.env)
-        callback.on_training_start(locals(), globals())
-        while self._goes_on(learning) and self._search_goes_on():  # line 3
-            self._meta_iterate(learning)  # lines 4-8
-        if self._goes_on(learning):
-            self._fix_program()  # line 10
-        while self._goes_on(learning):  # line 11
-            self._meta_iterate(learning)  # lines 12-16
-        callback.on_training_end()
+        with open_inner_loops(self) as inner_loops:
+            learning = _Learning(callback, log_interval, inner_loops)
+            callback.on_training_start(locals(), globals())
+            while self._goes_on(learning) and self._search_goes_on():  # line 3
+                self._meta_iterate(learning)  # lines 4-8
+            if self._goes_on(learning):
+                self._fix_program()  # line 10
+            while self._goes_on(learning):  # line 11
+                self._meta_iterate(learning)  # lines 12-16
+            callback.on_training_end()
         return self
 
     def _meta_iterate(self, learning: _Learning) -> None:
         """Make one meta-iteration: a task, inner updates on it, and a step of the initial parameters."""
-        theta, task, rng = begin_task(  # lines 4 and 12
-            self.policy.parameters(),
-            self.tasks,
-            self.n_envs,
-            n_tasks=self.tasks_per_iteration,
-            number=self.meta_iteration,
-            progress=1 - self._current_progress_remaining,
-            seed=self.seed,
-            rng=self.rng,
-        )
-        self._inner_updates(task, rng, learning)  # theta becomes theta_hat: lines 5-7 and 13-15
+        if self.meta_batch_size == 1:
+            theta, task, rng = self._begin_task()  # lines 4 and 12
+            self._inner_updates(task, rng, learning)  # theta becomes theta_hat: lines 5-7 and 13-15
+        else:
+            theta = self._inner_updates_of_batch(learning)
         self.meta_iteration += 1
         self.logger.record("reptile/meta_iteration", self.meta_iteration)
         if self.meta_update:
@@ -274,6 +285,39 @@ class ReptilePPO(SequencePPO):
             norm = self.outer_optimizer.step(self.policy.parameters(), theta, beta)  # lines 8 and 16
             self.logger.record("reptile/meta_learning_rate", beta)
             self.logger.record("reptile/meta_step_norm", norm)
+
+    def _begin_task(self, replica: int = 0) -> tuple[list[th.Tensor], Task, np.random.Generator]:
+        batched = self.meta_batch_size > 1  # then nothing random may be left to where an inner loop is made
+        return begin_task(
+            self.policy.parameters(),
+            self.tasks,
+            self.n_envs,
+            n_tasks=self.tasks_per_iteration,
+            number=self.meta_iteration,
+            progress=1 - self._current_progress_remaining,
+            seed=int(self.rng.integers(2**31)) if batched and self.seed is None else self.seed,
+            rng=self.rng,
+            replica=replica,
+        )
+
+    def _inner_updates_of_batch(self, learning: _Learning) -> list[th.Tensor]:
+        """Let several inner loops start from theta and take over the mean of their results; return theta."""
+        learning.callback.on_rollout_start()
+        assert learning.inner_loops is not None
+        begun = [self._begin_task(replica) for replica in range(self.meta_batch_size)]
+        theta = Theta.of(self)
+        results = learning.inner_loops.run(theta, [(task, rng) for _, task, rng in begun])
+        mean_of(results, theta).put_into(self)
+        for _ in range((self.num_timesteps - theta.num_timesteps) // self.n_envs):
+            if not learning.callback.on_step():
+                learning.stopped = True
+                break
+        learning.callback.on_rollout_end()
+        before, learning.n_rollouts = learning.n_rollouts, learning.n_rollouts + len(begun) * self.inner_updates
+        interval = learning.log_interval
+        if interval is not None and learning.n_rollouts // interval > before // interval:
+            self.dump_logs(learning.n_rollouts)
+        return begun[0][0]
 
     def inner_loop(self, theta: Theta, task: Task, rng: np.random.Generator) -> Theta:
         """Make the inner updates of one task: ``theta`` becomes ``theta_hat`` (lines 5-7).
@@ -286,9 +330,10 @@ class ReptilePPO(SequencePPO):
         :param rng: source of randomness in rollouts and updates
         :return: theta_hat, which the model holds then, too
         """
-        _, callback = self._setup_learn(theta.total_timesteps)
+        if self.ep_info_buffer is None or not hasattr(self, "_logger"):
+            self._setup_learn(theta.total_timesteps)
         theta.put_into(self)
-        self._inner_updates(task, rng, _Learning(callback))
+        self._inner_updates(task, rng, _Learning(self._init_callback(None)))
         return Theta.of(self)
 
     def _inner_updates(self, task: Task, rng: np.random.Generator, learning: _Learning) -> None:
@@ -346,74 +391,12 @@ class ReptilePPO(SequencePPO):
         """
         return extract_program(self, **metadata)
 
-    # ------------------------------------------------------------------------------------------- save and load
-
-    def save(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
-        *,
-        allow_pickle: bool = False,
-    ) -> None:
-        """Save the model as data: a zip of JSON and safetensors. A file is replaced only when the new one is complete.
-
-        :param path: of the file, or a stream
-        :param exclude: fields to leave out: names of constructor arguments
-        :param include: fields not to leave out, though they are in ``exclude``
-        :param allow_pickle: pickle what is not data, such as a function; :meth:`load` then asks for the same
-        :raises ValueError: if something is not data, or a parameter is not finite
-        """
-        write_model(self, path, exclude, include, allow_pickle)
-
-    @classmethod
-    def load(
-        cls: type[SelfReptilePPO],
-        path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | str | None = None,
-        device: th.device | str = "auto",
-        custom_objects: dict[str, Any] | None = None,
-        print_system_info: bool = False,
-        force_reset: bool = True,
-        *,
-        allow_pickle: bool = False,
-        **kwargs: Any,
-    ) -> SelfReptilePPO:
-        """Load a model, from data alone. See SB3's ``BaseAlgorithm.load`` for what is not said here.
-
-        :param path: of the file, or a stream
-        :param env: an environment id is accepted too; ``n_envs`` and ``env_kwargs`` are the saved ones unless given
-        :param custom_objects: fields to take instead of the file's
-        :param allow_pickle: load a file that you trust although it holds pickles, which runs the code in them: one
-            saved with ``allow_pickle=True``, or by release 0.1
-        :param kwargs: arguments of the constructor to change
-        :raises ValueError: if the file is damaged, holds pickles, or something cannot be changed
-        """
-        if print_system_info:
-            print_versions(path)
-        return load_model(cls, path, env, device, custom_objects or {}, force_reset, allow_pickle, kwargs)
-
     def set_env(self, env: GymEnv | str, force_reset: bool = True) -> None:
         """Set the environment, and append the interaction history to its observations if the policy reads it.
 
         :param env: an environment id is accepted too; it is made with the ``env_kwargs`` of this one
         :param force_reset: see SB3's ``BaseAlgorithm.set_env``
         """
-        made = isinstance(env, str)
+        self.env_by_id = made = isinstance(env, str)
         venv = make_venv(env, self.n_envs if made else None, self.seed, self.env_kwargs if made else {})
         super().set_env(with_history(venv, self.interaction_history), force_reset)
-
-    def set_parameters(
-        self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
-    ) -> None:
-        """Load parameters. See SB3's ``BaseAlgorithm.set_parameters``."""
-        super().set_parameters(parameters_of(self, load_path_or_dict), exact_match, device)
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", "policy.optimizer", "outer_optimizer"], []
-
-
-def _default_batch_size(n_steps: int, n_envs: int) -> int:
-    """Return an eighth of a rollout; where that is less than a sequence, the next smaller divisor of its length."""
-    size = max(2, n_steps * n_envs // 8)
-    return size if size >= n_steps else largest_divisor(n_steps, size)

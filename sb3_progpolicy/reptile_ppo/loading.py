@@ -38,7 +38,7 @@ _REFUSALS = (TypeError, AttributeError, AssertionError, ArithmeticError, LookupE
 
 
 def load_model(
-    cls: type[ReptilePPO],
+    cls: type[Any],
     path: str | os.PathLike[str] | io.BufferedIOBase,
     env: GymEnv | str | None,
     device: th.device | str,
@@ -49,6 +49,7 @@ def load_model(
 ) -> Any:
     """Make a model of a file. See ``ReptilePPO.load`` for the arguments.
 
+    :param cls: ReptilePPO
     :param changes: constructor arguments that replace those of the file
     :raises ModelFormatError: if the file is damaged or holds what is not accepted
     :raises ValueError: if the file holds pickles, the environment does not fit, or something cannot be changed
@@ -193,7 +194,7 @@ def _restore_state(model: ReptilePPO, state: Mapping[str, Any]) -> None:
         model.ep_success_buffer = deque(state["successes"], maxlen=window)
 
 
-def parameters_of(model: ReptilePPO, path_or_parameters: Any) -> Any:
+def parameters_of(model: Any, path_or_parameters: Any) -> Any:
     """Return what ``set_parameters`` is given as SB3 takes it: a path, or parameters, which may be of release 0.1."""
     if not isinstance(path_or_parameters, dict):
         if is_sb3_file(path_or_parameters):

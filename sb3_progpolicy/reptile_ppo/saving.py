@@ -94,6 +94,8 @@ ARGUMENTS: Mapping[str, Check] = {
     "env_kwargs": _mapping,
     "inner_updates": _count,
     "tasks_per_iteration": _count,
+    "meta_batch_size": _count,
+    "engine": _text,
     "meta_learning_rate": _schedule,
     "meta_optimizer": _text,
     "meta_update": _flag,

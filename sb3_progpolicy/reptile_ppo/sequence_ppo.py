@@ -34,6 +34,12 @@ def largest_divisor(number: int, limit: int) -> int:
     return next(divisor for divisor in range(min(number, limit), 0, -1) if number % divisor == 0)
 
 
+def default_batch_size(n_steps: int, n_envs: int) -> int:
+    """Return an eighth of a rollout; where that is less than a sequence, the next smaller divisor of its length."""
+    size = max(2, n_steps * n_envs // 8)
+    return size if size >= n_steps else largest_divisor(n_steps, size)
+
+
 class SequencePPO(PPO):
     """PPO for networks and programs, with a state or without.
 
