@@ -106,11 +106,12 @@ class Store:
         """Close all connections."""
         self.engine.dispose()
 
-    def add(self, suite: Suite, commands: Sequence[str]) -> None:
+    def add(self, suite: Suite, commands: Sequence[str], keep_members: bool = False) -> None:
         """Make a suite's cells those that it has now; what is known of them stays.
 
         :param suite: whose cells they are
         :param commands: that reproduce them, one each
+        :param keep_members: leave a suite that the store has with the cells that it has
         """
         for cell, command in zip(suite.cells, commands, strict=True):
             values = {
@@ -134,6 +135,8 @@ class Store:
         ]
         with self.engine.begin() as connection:
             known = connection.execute(sa.select(_MEMBERS).where(_MEMBERS.c.suite == suite.name)).mappings().all()
+            if known and keep_members:
+                return
             if sorted(map(_as_tuple, known)) != sorted(map(_as_tuple, members)):
                 connection.execute(sa.delete(_MEMBERS).where(_MEMBERS.c.suite == suite.name))
                 connection.execute(sa.insert(_MEMBERS), members)
@@ -267,7 +270,12 @@ class Store:
         with self.engine.connect() as connection:
             return list(connection.execute(sa.select(_MEMBERS.c.suite).distinct().order_by(_MEMBERS.c.suite)).scalars())
 
-    def _checked_suite(self, suite: str | None) -> str:
+    def checked_suite(self, suite: str | None) -> str:
+        """Return the name of a suite that the store has.
+
+        :param suite: its name; may be left out where there is only one
+        :raises ValueError: if there is no such suite
+        """
         known = self.suites()
         if suite is None and len(known) == 1:
             return known[0]
@@ -285,7 +293,7 @@ class Store:
         query = (
             sa.select(_CELLS)
             .join(_MEMBERS, _MEMBERS.c.key == _CELLS.c.key)
-            .where(_MEMBERS.c.suite == self._checked_suite(suite))
+            .where(_MEMBERS.c.suite == self.checked_suite(suite))
             .order_by(_MEMBERS.c.position)
         )
         with self.engine.connect() as connection:
@@ -301,26 +309,37 @@ class Store:
         :param suite: its name; may be left out where there is only one
         :raises ValueError: if there is no such suite
         """
-        cells = {row["key"]: row for row in self.cells(suite)}
-        query = sa.select(_ROWS).where(_ROWS.c.key.in_(list(cells))).order_by(_ROWS.c.id)
+        by_cell = self.raw_rows(suite)
+        return [_exported(cell, row) for cell in self.cells(suite) for row in by_cell.get(cell["key"], ())]
+
+    def raw_rows(self, suite: str | None = None) -> dict[str, list[dict[str, Any]]]:
+        """Return the rows of a suite's cells as :class:`CellResult` has them, by key of the cell.
+
+        :param suite: its name; may be left out where there is only one
+        :raises ValueError: if there is no such suite
+        """
+        query = (
+            sa.select(_ROWS)
+            .join(_MEMBERS, _MEMBERS.c.key == _ROWS.c.key)
+            .where(_MEMBERS.c.suite == self.checked_suite(suite))
+            .order_by(_ROWS.c.id)
+        )
+        by_cell: dict[str, list[dict[str, Any]]] = {}
         with self.engine.connect() as connection:
-            by_cell: dict[str, list[Any]] = {}
-            for row in connection.execute(query).mappings():
-                by_cell.setdefault(row["key"], []).append(row)
-        return [_exported(cells[key], row) for key in cells for row in by_cell.get(key, ())]
+            for found in connection.execute(query).mappings():
+                row = {name: value for name, value in found.items() if name not in ("id", "key")}
+                row |= {"variation": json.loads(row["variation"]), "semantics": row["semantics"] or None}
+                by_cell.setdefault(found["key"], []).append(row)
+        return by_cell
 
 
-def _exported(cell: dict[str, Any], row: Any) -> dict[str, Any]:
+def _exported(cell: dict[str, Any], row: dict[str, Any]) -> dict[str, Any]:
     result = cell["result"]
     return {
         "method": cell["method"],
         "env": cell["env"],
         "seed": cell["seed"],
-        "set": row["set"],
-        "relation": row["relation"],
-        "variation": json.loads(row["variation"]),
-        "semantics": row["semantics"] or None,
-        **{name: row[name] for name in ("episodes", "success_rate", "steps_mean", "steps_std", "optimal_steps_mean")},
+        **row,
         **{name: result[name] for name in ("timesteps", "capped", "processor_seconds", "wall_seconds", "commit")},
         "versions": " ".join(f"{name}={version}" for name, version in result["versions"].items()),
         "config": cell["key"],

@@ -87,18 +87,28 @@ def export(
     as_json: Annotated[bool, typer.Option("--json", help="as a JSON list")] = False,
     csv: Annotated[bool, typer.Option("--csv", help="as CSV, the default")] = False,
     curves: Annotated[bool, typer.Option("--curves", help="the training curves instead of the rows")] = False,
+    archive: Annotated[
+        Path | None, typer.Option("--archive", help="everything, as a .json.gz file for 'benchmark import'")
+    ] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="file; by default standard output")] = None,
     suite: ONE_SUITE = None,
 ) -> None:
     """Print the rows of a suite: one for each cell, variation and, where there is a program, semantics."""
+    from sb3_progpolicy.benchmark.archive import write_archive
     from sb3_progpolicy.benchmark.export import as_csv, curve_rows
     from sb3_progpolicy.benchmark.store import open_store
 
     if as_json and csv:
         raise ValueError("--json and --csv are not accepted together")
-    if output is not None:
-        check_folder(output)
+    if archive is not None and (as_json or csv or curves or output):
+        raise ValueError("--archive is not accepted together with --json, --csv, --curves or --output")
+    for path in (output, archive):
+        if path is not None:
+            check_folder(path)
     with open_store(store, create=False) as opened:
+        if archive is not None:
+            write_archive(opened, suite, archive)
+            return
         rows = curve_rows(opened.cells(suite)) if curves else opened.rows(suite)
     text = json.dumps(rows, indent=1) + "\n" if as_json else as_csv(rows)
     if output is None:
@@ -107,6 +117,18 @@ def export(
     from sb3_progpolicy.programs.files import write_atomically
 
     write_atomically(output, text)
+
+
+def import_(
+    archive: Annotated[Path, typer.Argument(help="file of 'benchmark export --archive'")], store: STORE = "results.db"
+) -> None:
+    """Take over the results of another store, such as another machine's; what this one has it keeps."""
+    from sb3_progpolicy.benchmark.archive import read_archive
+    from sb3_progpolicy.benchmark.store import open_store
+
+    with open_store(store) as opened:
+        new, known = read_archive(opened, archive)
+    typer.echo(f"{new} cells taken over, {known} known already")
 
 
 def report(
@@ -125,7 +147,13 @@ def report(
     typer.echo(str(page))
 
 
-COMMANDS: dict[str, Callable[..., None]] = {"run": run, "status": status, "export": export, "report": report}
+COMMANDS: dict[str, Callable[..., None]] = {
+    "run": run,
+    "status": status,
+    "export": export,
+    "import": import_,
+    "report": report,
+}
 
 
 def _beside(store: str) -> Path:

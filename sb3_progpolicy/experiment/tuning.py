@@ -195,7 +195,7 @@ def open_study(tuning: Tuning, storage: str | None, name: str | None = None) -> 
         with warnings.catch_warnings():  # Optuna has called these experimental since 2021
             warnings.simplefilter("ignore", ExperimentalWarning)
             retry: Callable[..., None] = RetryHeartbeatStaleTrialCallback(max_retry=3)
-            database = RDBStorage(storage, heartbeat_interval=HEARTBEAT, failed_trial_callback=retry)
+            database = RDBStorage(storage, heartbeat_interval=HEARTBEAT, heartbeat_stale_trial_callback=retry)
     sampler = optuna.samplers.TPESampler(n_startup_trials=tuning.n_startup_trials, seed=tuning.seed)
     study = optuna.create_study(
         storage=database,

@@ -1,0 +1,94 @@
+"""A suite's results as a file, and back."""
+
+import gzip
+import json
+
+import pytest
+
+from sb3_progpolicy.benchmark.archive import read_archive, write_archive
+from sb3_progpolicy.benchmark.cell import CellResult
+from sb3_progpolicy.benchmark.store import open_store
+from sb3_progpolicy.benchmark.suite import parse_suite
+from sb3_progpolicy.cli import run
+from tests.benchmark.small import RESULT, ROW, SMALL
+
+SUITE = parse_suite(SMALL)
+KEYS = [cell.key for cell in SUITE.cells]
+
+
+def fill(url, done, result=RESULT):
+    with open_store(url) as store:
+        store.add(SUITE, ["first", "second"])
+        for key in done:
+            assert store.finish(key, result)
+
+
+def state(url):
+    with open_store(url) as store:
+        return store.rows("small"), store.cells("small"), store.statuses(KEYS)
+
+
+def test_archive_holds_all_that_the_store_knows(url, tmp_path):
+    result = CellResult(
+        rows=[ROW, {**ROW, "semantics": None, "optimal_steps_mean": None}],
+        curve=[{"timesteps": 1}], program="{}", timesteps=9, capped=True, versions={"python": "3"}, commit="abc",
+    )  # fmt: skip
+    fill(url, KEYS[:1], result)
+    archive, other = tmp_path / "small.json.gz", str(tmp_path / "other.db")
+    with open_store(url) as store:
+        write_archive(store, None, archive)
+    with open_store(other) as store:
+        assert read_archive(store, archive) == (1, 0)
+        assert read_archive(store, archive) == (0, 1)
+    assert state(other) == state(url)
+    with open_store(other) as store:
+        write_archive(store, "small", tmp_path / "again.json.gz")
+    assert (tmp_path / "again.json.gz").read_bytes() == archive.read_bytes()
+
+
+def test_what_two_machines_did_apart_comes_together(tmp_path, capsys):
+    stores = [str(tmp_path / f"{name}.db") for name in "ab"]
+    for store, key, steps in zip(stores, KEYS, (63.0, 70.0), strict=True):
+        fill(store, [key], CellResult(rows=[{**ROW, "steps_mean": steps}]))
+    archive = str(tmp_path / "b.json.gz")
+    assert run(["benchmark", "export", stores[1], "--archive", archive]) == 0
+    assert run(["benchmark", "import", archive, "--store", stores[0]]) == 0
+    assert "1 cells taken over, 0 known already" in capsys.readouterr().out
+    rows, _, statuses = state(stores[0])
+    assert [(row["seed"], row["steps_mean"]) for row in rows] == [(0, 63.0), (1, 70.0)]
+    assert set(statuses.values()) == {"done"}
+
+
+def test_results_of_another_configuration_do_not_change_the_suite(tmp_path):
+    old = parse_suite({**SMALL, "episodes": 2})
+    archive, store = tmp_path / "old.json.gz", str(tmp_path / "now.db")
+    with open_store(str(tmp_path / "old.db")) as opened:
+        opened.add(old, ["old"] * 2)
+        opened.finish(old.cells[0].key, RESULT)
+        write_archive(opened, None, archive)
+    fill(store, KEYS[:1])
+    before = state(store)
+    with open_store(store) as opened:
+        assert read_archive(opened, archive) == (1, 0)
+    assert state(store) == before
+
+
+@pytest.mark.parametrize(("content", "message"), [
+    (b"", "is not what"),
+    (b"{}", "Not a gzipped file"),
+    (gzip.compress(b"{"), "is not what"),
+    (gzip.compress(b"[]"), "another format"),
+    (gzip.compress(json.dumps({"format": "sb3-progpolicy benchmark", "version": 9}).encode()), "version 9; this.* 1"),
+    (gzip.compress(json.dumps({"format": "sb3-progpolicy benchmark", "version": 1}).encode())[:-9], "is not what"),
+    (gzip.compress(json.dumps({"format": "sb3-progpolicy benchmark", "version": 1, "suite": "x",
+                               "cells": [{"cell": {}}]}).encode()), "is not what"),
+])  # fmt: skip
+def test_other_files_are_refused(tmp_path, content, message):
+    (tmp_path / "archive").write_bytes(content)
+    with open_store(str(tmp_path / "s.db")) as store, pytest.raises(ValueError, match=message):
+        read_archive(store, tmp_path / "archive")
+
+
+def test_missing_file_is_named(tmp_path):
+    with open_store(str(tmp_path / "s.db")) as store, pytest.raises(ValueError, match=r"nowhere\.gz does not exist"):
+        read_archive(store, tmp_path / "nowhere.gz")
