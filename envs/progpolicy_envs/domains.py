@@ -15,6 +15,7 @@ from typing import Any, Literal
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
+from progpolicy_envs.symmetry import Grid, Symmetry
 from progpolicy_envs.variation import Variation, VariationSpace
 
 #: How a variation stands to those trained on: one of them, between them, beyond them, or smaller than all of them.
@@ -65,11 +66,25 @@ class Domain:
     @property
     def space(self) -> VariationSpace | None:
         """The parameters: their kinds, bounds and defaults; ``None`` if the environment does not declare them."""
+        space = self._declared("variations", None)
+        return space if isinstance(space, VariationSpace) else None
+
+    @property
+    def symmetries(self) -> tuple[Symmetry, ...]:
+        """Generators of the symmetries under which the rules do not change; none if none are declared."""
+        return tuple(self._declared("symmetries", ()))
+
+    @property
+    def grids(self) -> tuple[Grid, ...]:
+        """The blocks of an observation that lie on a grid."""
+        return tuple(self._declared("grids", ()))
+
+    def _declared(self, name: str, default: Any) -> Any:
+        """Return what the environment's class declares under a name."""
         creator = load_env_creator(self.entry_point) if self.entry_point else gym.spec(self.id).entry_point
         if isinstance(creator, str):
             creator = load_env_creator(creator)
-        space = getattr(creator, "variations", None)
-        return space if isinstance(space, VariationSpace) else None
+        return getattr(creator, name, default)
 
     @property
     def trained(self) -> tuple[Variation, ...]:

@@ -13,6 +13,7 @@ from progpolicy_envs.planners import hanoi as planner
 from progpolicy_envs.planning import PlanningEnv
 from progpolicy_envs.rendering import hanoi_frame
 from progpolicy_envs.states import is_sequence
+from progpolicy_envs.symmetry import Permutation, Symmetry
 from progpolicy_envs.variation import IntParameter, Variation, VariationSpace
 from progpolicy_envs.vector import PlanningVectorEnv
 
@@ -28,6 +29,18 @@ ACTION_NAMES = tuple(f"move {source}->{target}" for source, target in MOVES)
 _OBSERVATION_SPACE = spaces.Box(
     np.tile(np.array([-1, -1, 0], np.float32), N_PEGS), np.ones(3 * N_PEGS, np.float32), dtype=np.float32
 )
+
+
+def _renamed(pegs: tuple[int, ...]) -> Symmetry:
+    """Return the symmetry that gives peg ``i`` the name ``pegs[i]``."""
+    old = {new: peg for peg, new in enumerate(pegs)}
+    observation = [3 * old[peg] + feature for peg in range(N_PEGS) for feature in range(3)]
+    action = [MOVES.index((old[source], old[target])) for source, target in MOVES]
+    return Symmetry("pegs", Permutation.of(observation), Permutation.of(action))
+
+
+#: The pegs may be renamed.
+SYMMETRIES = (_renamed((1, 0, 2)), _renamed((1, 2, 0)))
 
 
 def _check_variation(variation: Variation) -> None:
@@ -147,6 +160,7 @@ class HanoiEnv(PlanningEnv):
     variations: ClassVar[VariationSpace] = VARIATIONS
     observation_names: tuple[str, ...] = OBSERVATION_NAMES
     action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
+    symmetries: ClassVar[tuple[Symmetry, ...]] = SYMMETRIES
 
     def __init__(
         self,

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progpolicy_envs.documentation import with_sections
-from progpolicy_envs.layouts import N_CELLS, N_COLUMNS, N_ROWS
+from progpolicy_envs.layouts import DIRECTIONS, N_CELLS, N_COLUMNS, N_ROWS
 from progpolicy_envs.pathways import MapView, PathwayEnv, PathwayVectorEnv
+from progpolicy_envs.symmetry import Grid, Permutation, Symmetry
 
 REACH = 4  # cells that the window around the hiker shows to each side
 # A map with a frame of blocked cells around it, as wide as the window reaches.
@@ -19,6 +20,13 @@ _FRAME_WIDTH = N_COLUMNS + 2 * REACH
 _WINDOW = [
     (down, right) for down in range(-REACH, REACH + 1) for right in range(-REACH, REACH + 1) if (down, right) != (0, 0)
 ]
+_DIRECTIONS = list(DIRECTIONS.values())
+#: The hiker may turn by a quarter: what was north is west then.
+_QUARTER = Symmetry(
+    "compass",
+    Permutation.of(_WINDOW.index((right, -down)) for down, right in _WINDOW),
+    Permutation.of(_DIRECTIONS.index((right, -down)) for down, right in _DIRECTIONS),
+)
 _WINDOW_OFFSETS = np.array([down * _FRAME_WIDTH + right for down, right in _WINDOW])
 
 
@@ -145,6 +153,8 @@ class HikingEnv(_WholeMap, PathwayEnv):
     * v0: initial version; the egocentric observation has become ``HikingEgo-v0``
     """
 
+    grids: ClassVar[tuple[Grid, ...]] = (Grid.whole("map", 0, N_ROWS, N_COLUMNS),)
+
     def __init__(
         self,
         n_stars: int = 3,
@@ -190,6 +200,9 @@ class HikingEgoEnv(_FramedMap, PathwayEnv):
     ## Version History
     * v0: initial version; until then ``gym.make("Hiking-v0", observation="egocentric")``
     """
+
+    symmetries: ClassVar[tuple[Symmetry, ...]] = (_QUARTER,)
+    grids: ClassVar[tuple[Grid, ...]] = (Grid("window", 0, *zip(*_WINDOW, strict=True)),)
 
     def _seen(self, numbers: NDArray[np.float32]) -> NDArray[np.float32]:
         return numbers[self.places[self.hiker] + _WINDOW_OFFSETS]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,6 +14,7 @@ from progpolicy_envs.planners import stacking as planner
 from progpolicy_envs.planning import PlanningEnv
 from progpolicy_envs.rendering import stacking_frame
 from progpolicy_envs.states import Cell, is_sequence, read_cell
+from progpolicy_envs.symmetry import Grid, Permutation, Symmetry
 from progpolicy_envs.variation import IntParameter, Variation, VariationSpace
 from progpolicy_envs.vector import PlanningVectorEnv
 
@@ -43,6 +44,36 @@ _STACK, _GRIPPER = N_CELLS, N_CELLS + MAX_PLATES  # where the stack and the grip
 _OBSERVATION_SPACE = spaces.Box(
     np.array([0] * _GRIPPER + [-1] * 2, np.float32), np.ones(len(OBSERVATION_NAMES), np.float32), dtype=np.float32
 )
+
+
+def _turned(name: str, of_cell: Callable[[int, int], Cell], gripper: Permutation) -> Symmetry:
+    """Return a symmetry of the square table.
+
+    :param name: of the symmetry
+    :param of_cell: row and column, from -2 to 2, of the cell whose plate is seen on a row and column
+    :param gripper: of the gripper's row and column
+    """
+    half = N_SIDE // 2
+
+    def cell(row: int, column: int) -> int:
+        source = of_cell(row - half, column - half)
+        return (source[0] + half) * N_SIDE + source[1] + half
+
+    table = [cell(row, column) for row in range(N_SIDE) for column in range(N_SIDE)]
+    places = [_GRIPPER + index for index in gripper.source]
+    directions = list(DIRECTIONS.values())
+    actions = [directions.index(of_cell(*direction)) for direction in directions]
+    signs = [1] * _GRIPPER + list(gripper.signs)
+    observation = Permutation.of([*table, *range(_STACK, _GRIPPER), *places], signs)
+    return Symmetry(name, observation, Permutation.of([*actions, len(directions)]))
+
+
+#: The table may be turned by a quarter and looked at in a mirror.
+SYMMETRIES = (
+    _turned("table", lambda row, column: (-column, row), Permutation((1, 0), (1, -1))),
+    _turned("table", lambda row, column: (row, -column), Permutation((0, 1), (1, -1))),
+)
+GRIDS = (Grid.whole("table", 0, N_SIDE, N_SIDE),)
 
 
 def draw_task(generator: np.random.Generator, variation: Variation) -> tuple[NDArray[np.int64], int]:
@@ -143,6 +174,8 @@ class StackingEnv(PlanningEnv):
     variations: ClassVar[VariationSpace] = VARIATIONS
     observation_names: tuple[str, ...] = OBSERVATION_NAMES
     action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
+    symmetries: ClassVar[tuple[Symmetry, ...]] = SYMMETRIES
+    grids: ClassVar[tuple[Grid, ...]] = GRIDS
 
     def __init__(self, n_plates: int = 3, render_mode: str | None = None, context: str = "hidden") -> None:
         super().__init__({"n_plates": n_plates}, _OBSERVATION_SPACE, render_mode, context)

@@ -17,6 +17,7 @@ from progpolicy_envs.panda.scene import Scene
 from progpolicy_envs.panda.tasks import Task
 from progpolicy_envs.rendering import Frame
 from progpolicy_envs.single import DomainEnv, require_reset
+from progpolicy_envs.symmetry import Permutation, Symmetry
 from progpolicy_envs.variation import Variation, VariationSpace
 
 FlatObservation = NDArray[np.float32]
@@ -25,6 +26,19 @@ Action = NDArray[np.float32]
 
 #: Terms of the dense reward, see the class docstrings.
 PROGRESS, APPROACH, FINISHED, STEP, FAILURE = 10.0, 5.0, 1.0, -0.01, -5.0
+
+#: Left and right may be exchanged.
+MIRROR = Symmetry(
+    "mirror",
+    Permutation.flips(
+        OBSERVATION_NAMES,
+        (
+            *("gripper_y", "gripper_vy", "object_y", "object_dy", "object_vy", "target_y", "target_dy"),
+            *("line_y", "across", "turn_sin", "spin"),
+        ),
+    ),
+    Permutation.flips(ACTION_NAMES, ("move_y",)),
+)
 
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 _STILL = (0.0, 0.0, 0.0)
@@ -55,6 +69,7 @@ class PandaEnv(DomainEnv):
     controller: ClassVar[Callable[[FlatObservation], Action]]
     observation_names: tuple[str, ...] = OBSERVATION_NAMES
     action_names: ClassVar[tuple[str, ...]] = ACTION_NAMES
+    symmetries: ClassVar[tuple[Symmetry, ...]] = (MIRROR,)
 
     def __init__(
         self,

@@ -93,6 +93,7 @@ class EntryPoint:
     def __init__(self, flat: type[PandaEnv], goal: type[PandaGoalEnv]) -> None:
         self.forms: dict[str, type[PandaEnv]] = {"flat": flat, "goal": goal}
         self.metadata, self.variations, self.__doc__ = flat.metadata, flat.variations, flat.__doc__
+        self.symmetries = flat.symmetries
 
     def __call__(self, *args: Any, observation: str = "flat", **arguments: Any) -> PandaEnv:
         """Return the environment.
