@@ -103,9 +103,10 @@ def test_arm_and_its_mirror_image_move_alike(env_id):
     seen, _ = other.reset(seed=3, options={**start, **mirrored})
     rng = np.random.default_rng(0)
     for _ in range(15):
-        np.testing.assert_allclose(
-            mirror.observation(observation), seen, atol=0.06
-        )  # its seven joints are not quite symmetric
+        # The arm's seven joints are not quite symmetric, which velocities show.
+        differences = np.abs(mirror.observation(observation) - seen)
+        assert differences.max() < 0.15
+        assert differences[[not name[:-1].endswith("_v") for name in env.unwrapped.observation_names]].max() < 0.02
         action = rng.uniform(-1, 1, 4).astype(np.float32)
         observation = env.step(action)[0]
         seen = other.step(twin_action(mirror, action))[0]
