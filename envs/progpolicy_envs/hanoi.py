@@ -320,15 +320,41 @@ class HanoiVectorEnv(PlanningVectorEnv):
         for row in rows:
             source, target = _draw_pegs(self._pairs[row], self._generators[row])
             self._source[row], self._target[row] = source, target
-            # Bit per peg: source and target continue the alternation of n discs, the third base does not.
-            continued = (1 << source) | (1 << target)
-            self._bases[row] = continued if self._n_discs[row] % 2 else 2**N_PEGS - 1 - continued
+        self._colour_bases(rows)
+
+    def _colour_bases(self, rows: NDArray[np.intp]) -> None:
+        # Bit per peg: source and target continue the alternation of n discs, the third base does not.
+        continued = (1 << self._source[rows]) | (1 << self._target[rows])
+        self._bases[rows] = np.where(self._n_discs[rows] % 2, continued, 2**N_PEGS - 1 - continued)
 
     def _reset_rows(self, rows: NDArray[np.intp]) -> None:
         self._place_pegs(rows[self._random[rows]])
         self._bits[rows] = 0
         self._bits[rows, self._source[rows]] = self._full[rows]
         self._tops[rows] = self._TOP[self._bits[rows]]
+
+    @classmethod
+    def count_starts(cls, variation: Mapping[str, Any], any_state: bool = False) -> int:
+        """Return the number of pairs of pegs, times that of legal states, see :class:`PlanningVectorEnv`."""
+        n_discs = cls.variations.update(cls.variations.defaults, variation)["n_discs"]
+        return len(cls._pairs_of(variation)) * (N_PEGS**n_discs if any_state else 1)
+
+    @classmethod
+    def _pairs_of(cls, given: Mapping[str, Any]) -> list[tuple[int, int]]:
+        return _peg_pairs({"source": RANDOM, "target": RANDOM, **cls.variations.parse(given)})
+
+    def _put_starts(
+        self, variation: Variation, given: Mapping[str, Any], numbers: NDArray[np.int64], any_state: bool
+    ) -> None:
+        pairs = np.array(self._pairs_of(given))
+        rest, pair = np.divmod(numbers, len(pairs))
+        self._source, self._target = pairs[pair].T.copy()
+        self._colour_bases(self._rows)
+        self._bits[:] = 0
+        for disc in range(variation["n_discs"]):
+            rest, peg = np.divmod(rest, N_PEGS) if any_state else (rest, self._source)
+            self._bits[self._rows, peg] |= 1 << disc
+        self._tops = self._TOP[self._bits]
 
     def _move(self, actions: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         pegs = N_PEGS * self._rows

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from progpolicy_envs.counting import subsets
 from progpolicy_envs.layouts import (
     DIRECTIONS,
     LAYOUTS,
@@ -295,6 +297,22 @@ class PathwayVectorEnv(MapView, PlanningVectorEnv):
         for row in rows:
             layout, stars = draw_task(self._generators[row], self.row_variations[row])
             self._place(row, layout, layout.start, stars)
+
+    @classmethod
+    def count_starts(cls, variation: Mapping[str, Any], any_state: bool = False) -> int:
+        """Return the number of sets of stars on a map, see :class:`PlanningVectorEnv`."""
+        whole = cls.variations.update(cls.variations.defaults, variation)
+        if any_state or whole["layout"] == RANDOM:
+            return super().count_starts(variation, any_state)
+        return math.comb(len(named_layout(whole["layout"]).star_cells), whole["n_stars"])
+
+    def _put_starts(
+        self, variation: Variation, given: Mapping[str, Any], numbers: NDArray[np.int64], any_state: bool
+    ) -> None:
+        layout = named_layout(variation["layout"])
+        cells = np.array(layout.star_cells)
+        for row, chosen in enumerate(subsets(numbers, len(cells), variation["n_stars"])):
+            self._place(row, layout, layout.start, cells[chosen])
 
     def _place(self, row: int | np.intp, layout: Layout, hiker: int, stars: NDArray[np.int64]) -> None:
         numbers, places = self._numbers[row], self.places

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
@@ -9,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from progpolicy_envs.counting import arrangements
 from progpolicy_envs.layouts import DIRECTIONS
 from progpolicy_envs.planners import stacking as planner
 from progpolicy_envs.planning import PlanningEnv
@@ -293,6 +295,27 @@ class StackingVectorEnv(PlanningVectorEnv):
             self._grippers[row] = divmod(gripper, N_SIDE)
             self._plates[row], self._n_plates[row] = plates, len(plates)
         self._n_picked[rows] = 0
+        self._show_grippers()
+
+    @classmethod
+    def count_starts(cls, variation: Mapping[str, Any], any_state: bool = False) -> int:
+        """Return the number of places for plates and gripper, see :class:`PlanningVectorEnv`."""
+        if any_state:
+            return super().count_starts(variation, any_state)
+        n_plates = cls.variations.update(cls.variations.defaults, variation)["n_plates"]
+        return math.perm(N_CELLS, n_plates) * N_CELLS
+
+    def _put_starts(
+        self, variation: Variation, given: Mapping[str, Any], numbers: NDArray[np.int64], any_state: bool
+    ) -> None:
+        arrangement, gripper = np.divmod(numbers, N_CELLS)
+        n_plates = variation["n_plates"]
+        plates = arrangements(arrangement, N_CELLS, n_plates)
+        self._numbers[:] = 0
+        self._numbers[self._rows[:, None], plates] = DOMINANCE ** -np.arange(n_plates)
+        self._grippers = np.stack(np.divmod(gripper, N_SIDE), axis=1)
+        self._plates = list(plates)
+        self._n_plates[:], self._n_picked[:] = n_plates, 0
         self._show_grippers()
 
     def _move(self, actions: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:

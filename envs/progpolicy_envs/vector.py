@@ -208,8 +208,68 @@ class PlanningVectorEnv(DomainVectorEnv):
     """N environments of a planning domain, stepped by array operations.
 
     A subclass keeps its state in arrays whose first axis is the environment and implements :meth:`_reset_rows`,
-    :meth:`_move`, :meth:`_observe`, :meth:`_state_of`, :meth:`_set_state_of` and :meth:`_optimal_steps`.
+    :meth:`_move`, :meth:`_observe`, :meth:`_state_of`, :meth:`_set_state_of` and :meth:`_optimal_steps`; and
+    :meth:`count_starts` and :meth:`_put_starts` where its starts can be counted.
     """
+
+    @classmethod
+    def count_starts(cls, variation: Mapping[str, Any], any_state: bool = False) -> int:
+        """Return in how many states an episode of a variation can begin.
+
+        A parameter that is not given has its default, or all its values where it may be ``"random"``.
+
+        :param variation: values of parameters
+        :param any_state: count all legal states instead
+        :raises ValueError: if they cannot be counted
+        """
+        raise ValueError(f"the {'states' if any_state else 'starts'} of {dict(variation)} cannot be counted")
+
+    def reset_to(self, variation: Mapping[str, Any], numbers: NDArray[np.int64], any_state: bool = False) -> Any:
+        """Begin an episode in every environment in the start of a number.
+
+        :param variation: see :meth:`count_starts`
+        :param numbers: ``(num_envs,)``, from 0 to ``count_starts(...) - 1``
+        :param any_state: see :meth:`count_starts`
+        :return: observations
+        :raises ValueError: if a value is not accepted
+        """
+        count = self.count_starts(variation, any_state)
+        if numbers.shape != (self.num_envs,) or numbers.min() < 0 or numbers.max() >= count:
+            raise ValueError(f"numbers={numbers!r} are not accepted; {self.num_envs} from 0 to {count - 1} are")
+        row_variation = self.variations.update(self.variations.defaults, variation)
+        self.row_variations = [row_variation] * self.num_envs
+        self._changed_variations()
+        self._elapsed[:] = 0
+        self._put_starts(row_variation, variation, numbers, any_state)
+        self._started = True
+        return self._observation()
+
+    def advance(
+        self, actions: NDArray[np.integer]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_]]:
+        """Apply one action in every environment, and begin no new episode where one ends.
+
+        :param actions: ``(num_envs,)``
+        :return: observations, rewards, and where the goal is reached
+        """
+        require_reset(self._started, "advance()")
+        rewards, solved = self._move(self._checked(actions))
+        return self._observation(), rewards, solved
+
+    def state_of(self, row: int) -> dict[str, Any]:
+        """Return the present state of one environment, which ``reset(options=...)`` of the single form takes."""
+        require_reset(self._started, "state_of()")
+        return self._state_of(row)
+
+    def _put_starts(
+        self, variation: Variation, given: Mapping[str, Any], numbers: NDArray[np.int64], any_state: bool
+    ) -> None:
+        """Put every environment into the start of a number.
+
+        :param variation: the whole variation
+        :param given: those of its values that were given
+        """
+        raise NotImplementedError
 
     def optimal_steps(self) -> NDArray[np.int64]:
         """Return how many steps the planner needs from each environment's present state, ``(num_envs,)``."""
