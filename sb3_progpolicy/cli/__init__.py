@@ -13,7 +13,21 @@ from typing import Annotated, Any
 
 import typer
 
-from sb3_progpolicy.cli import benchmark, card, compare, envs, evaluate, plan, play, render, show, train, tune
+from sb3_progpolicy.cli import (
+    benchmark,
+    card,
+    compare,
+    envs,
+    evaluate,
+    plan,
+    play,
+    render,
+    show,
+    simplify,
+    train,
+    tune,
+    verify,
+)
 from sb3_progpolicy.cli.parsing import repeat_flags
 from sb3_progpolicy.nearest import unknown
 
@@ -30,6 +44,8 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "compare": compare.compare,
     "card": card.card,
     "show": show.show,
+    "simplify": simplify.simplify,
+    "verify": verify.verify,
     "render": render.render,
     "play": play.play,
     "plan": plan.plan,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import os
 from collections.abc import Callable
@@ -39,6 +40,15 @@ def save_program(program: ProgramData, path: str | os.PathLike[str]) -> None:
     if len(text) > MAX_BYTES or text.count("[") + text.count("{") > MAX_CONTAINERS:
         raise ValueError(f"the program takes {len(text)} bytes as JSON; at most {MAX_BYTES} are accepted")
     write_atomically(path, text)
+
+
+def program_digest(program: ProgramData) -> str:
+    """Return what tells programs apart: sixteen hexadecimal digits that follow from all but its metadata.
+
+    :param program: well formed
+    """
+    described = _to_json(dataclasses.replace(program, metadata={}))
+    return hashlib.sha256(json.dumps(described, sort_keys=True, allow_nan=False).encode()).hexdigest()[:16]
 
 
 def read_program(path: str | os.PathLike[str]) -> ProgramData:

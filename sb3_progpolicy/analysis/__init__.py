@@ -1,0 +1,1 @@
+"""Programs made small and checked: simplification to the fewest terms, and verification from all starts."""

@@ -1,0 +1,307 @@
+"""The same decisions with the fewest and roundest numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from progpolicy_envs import Domain, get_domain
+from progpolicy_envs.symmetry import Symmetry
+from sb3_progpolicy.analysis.integer import MAX_WEIGHT, Solution, fewest_terms
+from sb3_progpolicy.analysis.situations import Situations, meet
+from sb3_progpolicy.analysis.terms import Floats, Term, terms_of
+from sb3_progpolicy.nearest import unknown
+from sb3_progpolicy.programs.interpreter import ProgramRunner
+from sb3_progpolicy.programs.io import program_digest
+from sb3_progpolicy.programs.program import Program
+from sb3_progpolicy.programs.syntax import Condition, Controller, Expression, IfThenElse, ProgramData
+
+EquallyGood = Literal["program", "planner"]
+#: How often situations that only the simplified program meets are added.
+_ROUNDS = 8
+
+
+@dataclass(frozen=True)
+class Simplification:
+    """A program and a smaller one that makes the same decisions on the training variations.
+
+    :param program: the smaller one
+    :param terms_before: numbers of the original that are not zero
+    :param terms_after: numbers of the smaller one's rules; a number that a symmetry repeats counts once
+    :param terms_lower_bound: no program of this form has fewer terms
+    :param tied: whether one rule stands for all directions
+    :param symmetry: name of the symmetry that ties it; ``None`` if it is not tied
+    :param equally_good: whose actions were kept to: the original's, or all that the planner calls as good
+    :param situations: distinct inputs that were looked at
+    :param starts: from how many starts they come
+    :param exhaustive: whether these are all starts of the training variations
+    :param seconds: that it took
+    :param notes: what was tried and did not succeed, in sentences
+    """
+
+    program: Program
+    terms_before: int
+    terms_after: int
+    terms_lower_bound: int
+    tied: bool
+    symmetry: str | None
+    equally_good: str
+    situations: int
+    starts: int
+    exhaustive: bool
+    seconds: float
+    notes: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all but the program as JSON values."""
+        fields = dataclasses.asdict(dataclasses.replace(self, program=None))  # type: ignore[arg-type]
+        del fields["program"]
+        return {**fields, "notes": list(self.notes)}
+
+
+def count_numbers(program: ProgramData) -> int:
+    """Return how many numbers of a program are not zero."""
+    return sum(_count(node) for node in (*program.conditions, *program.controllers))
+
+
+def _count(node: Condition | Controller) -> int:
+    numbers = [value for value in vars(node).values() if not isinstance(value, str)]
+    return sum(int(np.count_nonzero(np.array(value))) for value in numbers)
+
+
+def simplify(
+    program: ProgramData,
+    env_id: str | None = None,
+    variations: Sequence[Mapping[str, Any]] | None = None,
+    *,
+    equally_good: EquallyGood = "program",
+    tie: bool = True,
+    n_starts: int = 300,
+    time_limit: float = 60.0,
+    max_weight: int = MAX_WEIGHT,
+    seed: int = 0,
+) -> Simplification:
+    """Return the program with the fewest whole numbers that makes the same decisions on training variations.
+
+    The distinct inputs that the program meets are constraints of a mixed-integer linear program, whose bound says
+    how few terms any program of the same form needs. Its form: the conditions and branches of the original, weights
+    that are whole numbers up to ``max_weight``, tied over the domain's symmetries if that is possible, and functions of
+    row and column on grids. Recurrent conditions stay as they are.
+
+    :param program: acts in a Discrete space
+    :param env_id: id of a planning domain; by default the one in the program's metadata
+    :param variations: to look at; by default those that the domain is trained on
+    :param equally_good: ``"program"`` keeps to the program's own actions, ``"planner"`` to those that begin a shortest
+        solution, each of which is made to beat all others
+    :param tie: whether to tie weights over the domain's symmetries
+    :param n_starts: starts of each variation that are looked at; drawn where there are more
+    :param time_limit: seconds for each rule
+    :param max_weight: largest size of a weight
+    :param seed: of the drawn starts
+    :raises ValueError: if an argument is not accepted
+    """
+    began = time.monotonic()
+    env_id = env_id or str(program.metadata.get("env") or "")
+    if not env_id:
+        raise ValueError("the program does not say which environment it is for; give env_id")
+    if equally_good not in ("program", "planner"):
+        raise unknown("equally_good", equally_good, ("program", "planner"))
+    if program.action.kind != "discrete":
+        raise ValueError(f"{program.action.kind} actions are not accepted here; Discrete ones are")
+    domain = get_domain(env_id)
+    variations = domain.trained if variations is None else variations
+    planner = equally_good == "planner"
+    situations = meet(program, env_id, variations, n_starts, planner, seed)
+    if not len(situations.inputs):
+        raise ValueError("the program meets no situation; its variations are solved at the start")
+    notes: list[str] = []
+    for number in range(_ROUNDS):
+        rules = _Rules(program, situations, domain, tie, time_limit, max_weight)
+        small = rules.program()
+        met = meet(small, env_id, variations, n_starts, planner, seed + number, situations)
+        if not planner:
+            met = _relabelled(met, len(situations.inputs), program)
+        wrong = _wrong(small, met)
+        if not wrong.any():
+            situations = met
+            break
+        situations = met
+    else:
+        notes.append(f"in {int(wrong.sum())} of {len(met.inputs)} situations it decides otherwise")
+    notes = [*rules.notes, *notes]
+    metadata = {
+        **program.metadata,
+        "simplified": {
+            "from": program_digest(program),
+            "terms": rules.n_terms,
+            "terms_lower_bound": rules.lower_bound,
+            "symmetry": rules.symmetry,
+            "equally_good": equally_good,
+        },
+    }
+    if grids := [grid for grid in domain.grids if _is_whole(grid)]:
+        metadata["grids"] = [
+            {"name": grid.name, "start": grid.start, "rows": len(set(grid.rows)), "columns": len(set(grid.columns))}
+            for grid in grids
+        ]
+    return Simplification(
+        program=Program(**{**vars(small), "metadata": metadata}),
+        terms_before=count_numbers(program),
+        terms_after=rules.n_terms,
+        terms_lower_bound=rules.lower_bound,
+        tied=rules.symmetry is not None,
+        symmetry=rules.symmetry,
+        equally_good=equally_good,
+        situations=len(situations.inputs),
+        starts=situations.starts,
+        exhaustive=situations.exhaustive,
+        seconds=round(time.monotonic() - began, 1),
+        notes=tuple(notes),
+    )
+
+
+def _is_whole(grid: Any) -> bool:
+    return len(set(grid.rows)) * len(set(grid.columns)) == len(grid.rows)
+
+
+def _relabelled(met: Situations, n_known: int, program: ProgramData) -> Situations:
+    """Let the original say what is to be done in situations that only the simplified program has met."""
+    new = met.inputs[n_known:]
+    if not len(new) or any(condition.cell != "affine" for condition in program.conditions):
+        return met
+    runner = ProgramRunner(program, len(new))
+    allowed, branches = met.allowed.copy(), met.branches.copy()
+    allowed[n_known:] = False
+    allowed[np.arange(n_known, len(allowed)), runner.act(new) - program.action.start] = True
+    branches[n_known:] = runner.branch
+    return dataclasses.replace(met, allowed=allowed, branches=branches)
+
+
+def _wrong(program: ProgramData, situations: Situations) -> NDArray[np.bool_]:
+    """Return in which situations a program chooses what it may not; those that depend on memory are left out."""
+    if any(condition.cell != "affine" for condition in program.conditions):
+        return np.zeros(len(situations.inputs), dtype=bool)
+    actions = ProgramRunner(program, len(situations.inputs)).act(situations.inputs) - program.action.start
+    wrong = ~situations.allowed[np.arange(len(actions)), actions]
+    return np.asarray(wrong & situations.allowed.any(axis=1))
+
+
+class _Rules:
+    """The conditions and controllers of a program, each made small.
+
+    :param program: the original
+    :param situations: that constrain them
+    :param domain: whose symmetries and grids they may use
+    :param tie: whether to tie weights
+    :param time_limit: seconds for each
+    :param max_weight: largest size of a weight
+    """
+
+    def __init__(
+        self,
+        program: ProgramData,
+        situations: Situations,
+        domain: Domain,
+        tie: bool,
+        time_limit: float,
+        max_weight: int,
+    ) -> None:
+        self.original, self.situations, self.domain = program, situations, domain
+        self.time_limit, self.max_weight = time_limit, max_weight
+        self.notes: list[str] = []
+        self.n_terms, self.lower_bound = 0, 0
+        self.symmetry: str | None = None
+        self.ties: list[bool] = []
+        self.tie = tie and bool(domain.symmetries)
+
+    def program(self) -> ProgramData:
+        """Return the program of the small rules."""
+        original = self.original
+        reached = sorted(set(self.situations.branches.tolist()) - {-1}) or list(range(len(original.controllers)))
+        recurrent = any(condition.cell != "affine" for condition in original.conditions)
+        if recurrent or (self.situations.branches == -1).any():
+            reached = list(range(len(original.controllers)))
+        controllers = {index: self._controller(index) for index in reached}
+        body: Expression = controllers[reached[-1]]
+        for index in reversed(reached[:-1]):
+            body = IfThenElse(self._condition(index), controllers[index], body)
+        self.symmetry = self.domain.symmetries[0].name if self.ties and all(self.ties) else None
+        return dataclasses.replace(original, body=body)
+
+    def _controller(self, index: int) -> Controller:
+        original = self.original.controllers[index]
+        here = self.situations.branches == index
+        inputs, allowed = self.situations.inputs[here], self.situations.allowed[here]
+        undecided = ~allowed.any(axis=1)
+        if undecided.any():
+            self.notes.append(f"{int(undecided.sum())} inputs belong to states in which no one action is good")
+
+        def rows(terms: Sequence[Term]) -> Floats:
+            return _preferences(terms, inputs[~undecided], allowed[~undecided])
+
+        solution, terms, tied = self._solve(rows, self.original.action.n_outputs, f"controller {index + 1}")
+        self.ties.append(tied)
+        if solution is None:
+            self.n_terms += _count(original)
+            return original
+        matrix = _summed(solution, terms)
+        return Controller(tuple(map(tuple, matrix[:, :-1].tolist())), tuple(matrix[:, -1].tolist()))
+
+    def _condition(self, index: int) -> Condition:
+        original = self.original.conditions[index]
+        if original.cell != "affine":
+            self.n_terms += _count(original)
+            self.notes.append(f"condition {index + 1} has a memory and stays as it is")
+            return original
+        reaching = self.situations.branches >= index
+        inputs, true = self.situations.inputs[reaching], self.situations.branches[reaching] == index
+
+        def rows(terms: Sequence[Term]) -> Floats:
+            values = _with_constant(inputs) @ np.concatenate([term.weights for term in terms]).T
+            return np.where(true, 1, -1)[:, None] * values
+
+        solution, terms, tied = self._solve(rows, 1, f"condition {index + 1}")
+        self.ties.append(tied)
+        if solution is None:
+            self.n_terms += _count(original)
+            return original
+        (weights,) = _summed(solution, terms)
+        return dataclasses.replace(original, readout=tuple(weights[:-1].tolist()), readout_bias=float(weights[-1]))
+
+    def _solve(self, rows: Any, n_outputs: int, name: str) -> tuple[Solution | None, list[Term], bool]:
+        attempts: list[tuple[bool, Sequence[Symmetry]]] = [(True, self.domain.symmetries)] if self.tie else []
+        for tied, symmetries in [*attempts, (False, ())]:
+            for grids in [self.domain.grids, ()] if self.domain.grids else [()]:
+                terms = terms_of(self.original, n_outputs, symmetries, grids)
+                solution = fewest_terms(rows(terms), self.time_limit, max_weight=self.max_weight)
+                if solution is not None:
+                    self.n_terms += solution.n_terms
+                    self.lower_bound += solution.lower_bound
+                    return solution, terms, tied
+            self.notes.append(
+                f"{name}: no {'tied ' if tied else ''}rule of whole numbers up to {self.max_weight} was found that "
+                "makes the same decisions"
+            )
+        return None, [], False
+
+
+def _with_constant(inputs: Floats) -> Floats:
+    return np.column_stack([inputs, np.ones(len(inputs))])
+
+
+def _preferences(terms: Sequence[Term], inputs: Floats, allowed: NDArray[np.bool_]) -> Floats:
+    """Return the rows of what has to be positive: an allowed action's score less another one's."""
+    scores = np.einsum("koi,ni->nok", np.stack([term.weights for term in terms]), _with_constant(inputs))
+    rows, good, bad = np.nonzero(allowed[:, :, None] & ~allowed[:, None, :])
+    return np.asarray(scores[rows, good] - scores[rows, bad])
+
+
+def _summed(solution: Solution, terms: Sequence[Term]) -> Floats:
+    matrix = np.einsum("k,koi->oi", solution.weights, np.stack([term.weights for term in terms]))
+    return np.asarray(matrix + 0.0)  # no negative zeros

@@ -1,0 +1,274 @@
+"""What a program does from every start that a variation has, or from some where they cannot be counted."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from progpolicy_envs import find_domain
+from sb3_progpolicy.analysis.rollout import batches, cap_of, make_batch, run_episodes, start_numbers
+from sb3_progpolicy.programs.interpreter import ProgramRunner, join_inputs
+from sb3_progpolicy.programs.io import program_digest
+from sb3_progpolicy.programs.syntax import ProgramData
+
+BATCH = 8192
+#: Starts that are gone through one by one, at most; where there are more, some are drawn.
+MAX_STARTS = 10_000_000
+#: Starts that are drawn where a variation has too many, or they cannot be counted.
+N_DRAWN = 1000
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What a program does on one variation.
+
+    :param variation: the parameters that were set
+    :param starts: how many starts were tried
+    :param solved: from how many of them the goal was reached
+    :param optimal: from how many in the fewest steps; ``None`` where there is no planner
+    :param worst_ratio: largest ratio of steps to the planner's, of those solved; ``None`` where there is no planner
+    :param exhaustive: whether these are all starts
+    :param success_bound: lower bound on the share of starts that are solved (Clopper and Pearson, one-sided, 95 %);
+        ``None`` where all were tried
+    :param counterexample: options (and, where the start is drawn, the seed) of the reset of the shortest start that
+        fails; ``None`` where none does
+    """
+
+    variation: Mapping[str, Any]
+    starts: int
+    solved: int
+    optimal: int | None
+    worst_ratio: float | None
+    exhaustive: bool
+    success_bound: float | None
+    counterexample: Mapping[str, Any] | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as JSON values."""
+        return dataclasses.asdict(self)
+
+
+def verify(
+    program: ProgramData,
+    env_id: str | None = None,
+    variations: Sequence[Mapping[str, Any]] | None = None,
+    *,
+    from_any_state: bool = False,
+    all_starts: bool = False,
+    n_starts: int | None = None,
+    max_steps: int | None = None,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Verification]:
+    """Run the crisp program once from every start of each variation, its memory being empty.
+
+    In the planning domains starts can be counted: pairs of pegs, places of plates and gripper, sets of stars. Where
+    they cannot, or there are more than :data:`MAX_STARTS`, a number of them is drawn, and the share of those that are
+    solved has a bound. A bound is a test, and not a proof.
+
+    :param program: what to verify
+    :param env_id: environment id; by default the one in the program's metadata
+    :param variations: parameters to set; by default those that the domain is trained on. What is not given has all its
+        values where it may be random
+    :param from_any_state: begin in all legal states, whether or not episodes begin there (Hanoi)
+    :param all_starts: go through all starts, however many there are
+    :param n_starts: draw this number of starts of each variation, if it has more
+    :param max_steps: cap on the steps of an episode in place of the registered one; an optimal solution always fits
+    :param seed: of the draw
+    :param progress: is called with the number of starts done and that of all of a variation
+    :return: one row for each variation
+    :raises ValueError: if an argument is not accepted
+    """
+    env_id = env_id or str(program.metadata.get("env") or "")
+    if not env_id:
+        raise ValueError("the program does not say which environment it is for; give env_id")
+    if all_starts and n_starts is not None:
+        raise ValueError(f"all_starts and n_starts={n_starts} are not accepted together")
+    if n_starts is not None and n_starts < 1:
+        raise ValueError(f"n_starts={n_starts} is not accepted; it is at least 1")
+    domain = find_domain(env_id)
+    if variations is None:
+        variations = [{}] if domain is None else domain.trained
+    rng = np.random.default_rng(seed)
+    rows = []
+    for variation in variations:
+        counted = _count(program, env_id, variation, from_any_state)
+        if counted is None:
+            if all_starts:
+                raise ValueError(f"all_starts is not accepted for {env_id} {dict(variation)}; they cannot be counted")
+            drawn = N_DRAWN if n_starts is None else n_starts
+            rows.append(_sampled(program, env_id, variation, drawn, max_steps, int(rng.integers(2**31)), progress))
+            continue
+        limit = n_starts if all_starts or n_starts is not None or counted <= MAX_STARTS else N_DRAWN
+        numbers = start_numbers(counted, limit, rng)
+        rows.append(_counted(program, env_id, variation, numbers, counted, from_any_state, max_steps, progress))
+    return rows
+
+
+def _count(program: ProgramData, env_id: str, variation: Mapping[str, Any], any_state: bool) -> int | None:
+    spec = gym.spec(env_id.rpartition(":")[2])
+    domain = find_domain(env_id)
+    if domain is None or domain.simulation or spec.vector_entry_point is None:
+        if any_state:
+            raise ValueError(f"{env_id}: its legal states cannot be counted; leave out from_any_state")
+        return None
+    venv = make_batch(program, env_id, 1)
+    try:
+        return venv.count_starts(variation, any_state)
+    except ValueError as error:
+        if any_state or "cannot be counted" not in str(error):
+            raise
+        return None
+
+
+def _counted(
+    program: ProgramData,
+    env_id: str,
+    variation: Mapping[str, Any],
+    numbers: NDArray[np.int64],
+    count: int,
+    any_state: bool,
+    max_steps: int | None,
+    progress: Callable[[int, int], None] | None,
+) -> Verification:
+    tally = _Tally()
+    for part in batches(numbers, BATCH):
+        venv = make_batch(program, env_id, len(part))
+        observations = venv.reset_to(variation, part, any_state)
+        optimal = venv.optimal_steps()
+        cap = max_steps or max(cap_of(env_id), 2 * int(optimal.max()))
+        steps = run_episodes(program, venv, observations, cap)
+        shortest = tally.add(steps, optimal.astype(np.float64))
+        if shortest is not None:
+            one = make_batch(program, env_id, 1)
+            one.reset_to(variation, part[shortest : shortest + 1], any_state)
+            tally.counterexample = {"options": one.state_of(0)}
+        if progress is not None:
+            progress(tally.starts, len(numbers))
+    return tally.row(variation, exhaustive=len(numbers) == count)
+
+
+def _sampled(
+    program: ProgramData,
+    env_id: str,
+    variation: Mapping[str, Any],
+    n_starts: int,
+    max_steps: int | None,
+    seed: int,
+    progress: Callable[[int, int], None] | None,
+) -> Verification:
+    """Run a program in single environments, each episode from a seed of its own."""
+    tally = _Tally()
+    env = gym.make(env_id, max_episode_steps=max_steps)
+    try:
+        for number in range(n_starts):
+            observation, info = env.reset(seed=seed + number, options=dict(variation) or None)
+            optimal = info.get("optimal_steps")
+            steps = next((step for step, solved in _episode(program, env, observation) if solved), -1)
+            failed = tally.add(np.array([steps]), np.array([np.nan if optimal is None else optimal]))
+            if failed is not None:
+                tally.counterexample = {"seed": seed + number, "options": dict(variation)}
+            if progress is not None:
+                progress(tally.starts, n_starts)
+    finally:
+        env.close()
+    return tally.row(variation, exhaustive=False)
+
+
+def _episode(program: ProgramData, env: gym.Env[Any, Any], observation: Any) -> Iterator[tuple[int, bool]]:
+    """Yield after each step its number and whether the goal is reached."""
+    runner, previous, reward, step, over = ProgramRunner(program), None, 0.0, 0, False
+    while not over:
+        flat = np.asarray(observation, dtype=np.float64).reshape(1, -1)
+        action = runner.act(join_inputs(program, flat, previous, np.float32(reward), False))
+        observation, reward, terminated, truncated, info = env.step(action[0])  # type: ignore[assignment]
+        previous, step, over = action, step + 1, terminated or truncated
+        yield step, bool(info.get("is_success", False))
+
+
+class _Tally:
+    """Counts how episodes ended."""
+
+    def __init__(self) -> None:
+        self.starts = self.solved = self.n_optimal = 0
+        self.has_planner = True
+        self.worst: float | None = None
+        self.shortest = np.inf
+        self.counterexample: dict[str, Any] | None = None
+
+    def add(self, steps: NDArray[np.int64], optimal: NDArray[np.float64]) -> int | None:
+        """Count episodes.
+
+        :param steps: -1 where the goal was not reached
+        :param optimal: fewest steps; NaN where there is no planner
+        :return: the place of the shortest one that fails, if it is shorter than those before
+        """
+        reached = steps >= 0
+        self.starts += len(steps)
+        self.solved += int(reached.sum())
+        if np.isnan(optimal).any():
+            self.has_planner = False
+        else:
+            self.n_optimal += int((steps == optimal).sum())
+            ratios = steps[reached & (optimal > 0)] / optimal[reached & (optimal > 0)]
+            if len(ratios):
+                self.worst = max(float(ratios.max()), self.worst or 0.0)
+        failed = np.flatnonzero(~reached)
+        if not len(failed):
+            return None
+        lengths = np.nan_to_num(optimal[failed], nan=1e9)
+        if lengths.min() >= self.shortest:
+            return None
+        self.shortest = float(lengths.min())
+        return int(failed[lengths.argmin()])
+
+    def row(self, variation: Mapping[str, Any], exhaustive: bool) -> Verification:
+        """Return what was counted."""
+        return Verification(
+            variation=dict(variation),
+            starts=self.starts,
+            solved=self.solved,
+            optimal=self.n_optimal if self.has_planner else None,
+            worst_ratio=self.worst if self.has_planner else None,
+            exhaustive=exhaustive,
+            success_bound=None if exhaustive else success_bound(self.solved, self.starts),
+            counterexample=self.counterexample,
+        )
+
+
+def success_bound(solved: int, starts: int, confidence: float = CONFIDENCE) -> float:
+    """Return the one-sided lower bound of Clopper and Pearson (1934) on a share.
+
+    :param solved: successes
+    :param starts: trials
+    :param confidence: 0 to 1
+    """
+    from scipy.stats import beta
+
+    return 0.0 if solved == 0 else float(beta.ppf(1 - confidence, solved, starts - solved + 1))
+
+
+def certificate(program: ProgramData, env_id: str, rows: Sequence[Verification], command: str) -> dict[str, Any]:
+    """Return rows with what they are about, as JSON values.
+
+    :param program: that was verified
+    :param env_id: in which environment
+    :param rows: from :func:`verify`
+    :param command: that reproduces them
+    """
+    from importlib.metadata import version
+
+    return {
+        "program": program_digest(program),
+        "env": env_id,
+        "command": command,
+        "versions": {name: version(name) for name in ("sb3-progpolicy", "gymnasium", "numpy")},
+        "rows": [row.to_json() for row in rows],
+    }

@@ -1,0 +1,131 @@
+"""``progpolicy simplify``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sb3_progpolicy.cli.parsing import ALLOW_PICKLE, check_folder, default_variations, parse_variations
+from sb3_progpolicy.cli.streams import quiet_stdout
+from sb3_progpolicy.experiment.sources import find_source
+
+if TYPE_CHECKING:
+    from sb3_progpolicy.analysis.simplify import Simplification
+    from sb3_progpolicy.programs.program import Program
+
+
+def simplify(
+    run_or_name: Annotated[str, typer.Argument(help="run folder, program (.json), model (.zip) or pretrained name")],
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="file of the small program, .json")] = None,
+    variations: Annotated[
+        list[str] | None, typer.Option("--set", help="variations to look at; by default the training ones")
+    ] = None,
+    equally_good: Annotated[
+        str, typer.Option("--equally-good", help="program: keep to its actions; planner: to any of a shortest solution")
+    ] = "program",
+    tie: Annotated[bool, typer.Option("--tie/--no-tie", help="one rule for all directions, if there is one")] = True,
+    starts: Annotated[int, typer.Option("--starts", min=1, help="of each variation, drawn if it has more")] = 300,
+    time_limit: Annotated[float, typer.Option("--time-limit", min=1, help="seconds for each rule")] = 60,
+    max_weight: Annotated[int, typer.Option("--max-weight", min=1, max=1000, help="largest whole number")] = 8,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="of the drawn starts")] = 0,
+    episodes: Annotated[int, typer.Option("--episodes", min=1, help="of the comparison, on each variation")] = 20,
+    env: Annotated[str | None, typer.Option("--env", help="another environment than it was trained in")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="a JSON object on stdout, nothing else")] = False,
+    allow_pickle: Annotated[bool, typer.Option("--allow-pickle", help=ALLOW_PICKLE)] = False,
+) -> None:
+    """Find the program with the fewest whole numbers that makes the same decisions on the training variations.
+
+    It says how few any program of the same form needs, and then measures both, on larger variations too.
+    """
+    if output is not None:
+        check_folder(output)
+        if output.suffix.lower() != ".json":
+            raise ValueError(f"-o {str(output)!r} is not accepted; the file is a .json")
+    from sb3_progpolicy.analysis.simplify import simplify as simplified
+
+    with quiet_stdout():
+        source = find_source(run_or_name, allow_pickle)
+        if source.program is None:
+            raise ValueError(f"{run_or_name} is not a program; ProgPolicy and PRLPolicy learn programs")
+        env_id = env or source.env_id
+        if env_id is None:
+            raise ValueError(f"{run_or_name} does not say which environment it is for; give --env")
+        found = simplified(
+            source.program,
+            env_id,
+            parse_variations(variations) if variations else None,
+            equally_good=equally_good,  # type: ignore[arg-type]
+            tie=tie,
+            n_starts=starts,
+            time_limit=time_limit,
+            max_weight=max_weight,
+            seed=seed,
+        )
+        if output is not None:
+            found.program.save(output)
+        rows = _compared(source.program, found.program, env_id, episodes, seed)
+    if as_json:
+        typer.echo(json.dumps({**found.to_json(), "evaluation": rows}, indent=1))
+        return
+    typer.echo(str(found.program), nl=False)
+    _print_summary(found, rows, env_id)
+    if output is not None:
+        typer.echo(f"Wrote {output}", err=True)
+
+
+def _compared(original: Program, small: Program, env_id: str, episodes: int, seed: int) -> list[dict[str, object]]:
+    """Evaluate both on the same episodes of all variations."""
+    from sb3_progpolicy.evaluation import evaluate_program
+
+    variations = default_variations(env_id)
+    both = [evaluate_program(program, env_id, variations, episodes, seed=seed) for program in (original, small)]
+    return [
+        {
+            "variation": dict(before.variation),
+            "episodes": episodes,
+            **{f"{name}_before": getattr(before, name) for name in ("success_rate", "steps_mean")},
+            **{f"{name}_after": getattr(after, name) for name in ("success_rate", "steps_mean")},
+            "optimal_steps_mean": before.optimal_steps_mean,
+        }
+        for before, after in zip(*both, strict=True)
+    ]
+
+
+def _print_summary(found: Simplification, rows: list[dict[str, object]], env_id: str) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    bound = found.terms_lower_bound
+    words = (
+        "no program of this form has fewer"
+        if bound == found.terms_after
+        else f"none of this form has less than {bound}"
+    )
+    tied = f", one rule for all {found.symmetry}" if found.symmetry else ""
+    console.print(
+        f"\n{found.terms_before} numbers before, {found.terms_after} {'term' if found.terms_after == 1 else 'terms'} "
+        f"now{tied}; {words}. {found.situations} situations from {'all' if found.exhaustive else 'drawn'} "
+        f"{found.starts} starts, {found.seconds} s.",
+        soft_wrap=True,
+        highlight=False,
+    )
+    for note in found.notes:
+        console.print(note, soft_wrap=True, highlight=False)
+    table = Table(title=f"{env_id}, {rows[0]['episodes']} episodes each")
+    for name in ("variation", "success before", "after", "steps before", "after", "planner"):
+        table.add_column(name, justify="left" if name == "variation" else "right")
+    for row in rows:
+        optimal = row["optimal_steps_mean"]
+        table.add_row(
+            ", ".join(f"{name}={value}" for name, value in row["variation"].items()),  # type: ignore[attr-defined]
+            f"{row['success_rate_before']:.0%}",
+            f"{row['success_rate_after']:.0%}",
+            f"{row['steps_mean_before']:g}",
+            f"{row['steps_mean_after']:g}",
+            "-" if optimal is None else f"{optimal:g}",
+        )
+    console.print(table)
