@@ -52,7 +52,8 @@ def make_batch(program: ProgramData, env_id: str, n_envs: int) -> PlanningVector
         venv = gym.make_vec(name, num_envs=n_envs, vectorization_mode="vector_entry_point").unwrapped
     if not isinstance(venv, PlanningVectorEnv):
         raise ValueError(f"{env_id} is not accepted; the planning domains have starts that can be chosen")
-    given, n_observations = action_spec(venv.single_action_space), int(np.prod(venv.single_observation_space.shape))
+    given = action_spec(venv.single_action_space)
+    n_observations = int(np.prod(venv.single_observation_space.shape or ()))
     if (given, n_observations) != (program.action, program.n_observations):
         raise ValueError(
             f"the program reads {program.n_observations} numbers and acts in {program.action.kind} "
@@ -69,19 +70,25 @@ def cap_of(env_id: str) -> int:
 
 
 def run_episodes(
-    program: ProgramData, venv: PlanningVectorEnv, observations: NDArray[Any], cap: int, visit: Visit | None = None
+    program: ProgramData,
+    venv: PlanningVectorEnv,
+    observations: NDArray[Any],
+    optimal: NDArray[np.int64],
+    cap: int,
+    visit: Visit | None = None,
 ) -> NDArray[np.int64]:
     """Run one episode in each environment from the state that it is in, the program's memory being empty.
 
     :param program: crisp
     :param venv: environments that have just been put into a start
     :param observations: of these starts
+    :param optimal: steps of the planner from there, ``(num_envs,)``
     :param cap: steps after which an episode has failed
     :param visit: is called before each step
     :return: steps to the goal, ``(num_envs,)``; -1 where it was not reached
     """
     runner = ProgramRunner(program, venv.num_envs)
-    steps = np.where(venv.optimal_steps() == 0, 0, -1)
+    steps = np.where(optimal == 0, 0, -1)
     active = steps < 0
     previous: NDArray[Any] | None = None
     rewards = np.zeros(venv.num_envs)

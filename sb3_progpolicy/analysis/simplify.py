@@ -67,7 +67,7 @@ class Simplification:
 
 def count_numbers(program: ProgramData) -> int:
     """Return how many numbers of a program are not zero."""
-    return sum(_count(node) for node in (*program.conditions, *program.controllers))
+    return sum(map(_count, program.conditions)) + sum(map(_count, program.controllers))
 
 
 def _count(node: Condition | Controller) -> int:

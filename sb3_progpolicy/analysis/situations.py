@@ -119,7 +119,8 @@ def meet(
         exhaustive &= len(numbers) == count
         for part in batches(numbers, BATCH):
             venv = make_batch(program, env_id, len(part))
-            steps = run_episodes(program, venv, venv.reset_to(variation, part), cap, collector)
+            observations = venv.reset_to(variation, part)
+            steps = run_episodes(program, venv, observations, venv.optimal_steps(), cap, collector)
             failures += int((steps < 0).sum())
         starts += len(numbers)
     inputs = np.array(collector.inputs).reshape(-1, program.n_inputs)

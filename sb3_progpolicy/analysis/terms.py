@@ -54,9 +54,7 @@ def terms_of(
 
 def _add(found: list[Term], span: Floats, pattern: Floats, group: Sequence[tuple[Floats, Floats]]) -> Floats:
     """Add the symmetric part of a pattern, unless there is none or it follows from those found."""
-    tied = (
-        sum((outputs @ pattern @ inputs.T for inputs, outputs in group), np.zeros_like(pattern)) if group else pattern
-    )
+    tied = pattern if not group else np.sum([outputs @ pattern @ inputs.T for inputs, outputs in group], axis=0)
     sizes = np.abs(tied[np.abs(tied) > 1e-9])
     if not len(sizes):
         return span

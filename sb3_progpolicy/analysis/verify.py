@@ -139,12 +139,14 @@ def _counted(
     progress: Callable[[int, int], None] | None,
 ) -> Verification:
     tally = _Tally()
+    venv = make_batch(program, env_id, min(BATCH, len(numbers)))
     for part in batches(numbers, BATCH):
-        venv = make_batch(program, env_id, len(part))
+        if len(part) != venv.num_envs:
+            venv = make_batch(program, env_id, len(part))
         observations = venv.reset_to(variation, part, any_state)
         optimal = venv.optimal_steps()
         cap = max_steps or max(cap_of(env_id), 2 * int(optimal.max()))
-        steps = run_episodes(program, venv, observations, cap)
+        steps = run_episodes(program, venv, observations, optimal, cap)
         shortest = tally.add(steps, optimal.astype(np.float64))
         if shortest is not None:
             one = make_batch(program, env_id, 1)

@@ -8,6 +8,7 @@ same bits.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any, Literal
 
 import numpy as np
@@ -119,7 +120,8 @@ class ProgramRunner:
             for controller in program.controllers
         ]
         self._splits = np.cumsum([len(block) for block in blocks])[: len(self._cells)]
-        self._constant, *self._columns = np.concatenate(blocks).T.copy()
+        self._constant, *columns = np.concatenate(blocks).T.copy()
+        self._columns = _nonzero(columns)
         self.reset()
 
     def reset(self) -> None:
@@ -210,7 +212,8 @@ class _Cell:
         constant[~apart] += self.hidden_bias[~apart]
         self.hidden_bias[~apart] = 0
         columns = np.array(condition.weight_hh).T
-        self.joined_columns, self.apart_columns = list(np.where(apart, 0, columns)), list(np.where(apart, columns, 0))
+        self.joined_columns = _nonzero(np.where(apart, 0, columns))
+        self.apart_columns = _nonzero(np.where(apart, columns, 0))
         self.rows = np.column_stack([constant, np.array(condition.weight_ih).reshape(len(constant), -1)])
 
     def reset(self) -> None:
@@ -224,13 +227,21 @@ class _Cell:
         joined = _accumulate(gates, self.joined_columns, self.h)
         apart = _accumulate(self.hidden_bias, self.apart_columns, self.h)
         self.h, self.c = STEPS[self.cell](joined, apart, self.h, self.c, _tanh)
-        return _accumulate(self.readout_bias[None], list(self.readout[:, None]), self.h)[:, 0]
+        return _accumulate(self.readout_bias[None], list(enumerate(self.readout[:, None])), self.h)[:, 0]
 
 
-def _accumulate(constant: Floats, columns: list[Floats], values: Floats) -> Floats:
+_Columns = list[tuple[int, Floats]]
+
+
+def _nonzero(columns: Iterable[Floats]) -> _Columns:
+    """Return the columns that are not 0 in all rows, each with its index."""
+    return [(index, column) for index, column in enumerate(columns) if column.any()]
+
+
+def _accumulate(constant: Floats, columns: _Columns, values: Floats) -> Floats:
     """``constant + sum_j columns[j] * values[:, j]``, added from left to right."""
     total = np.array(np.broadcast_to(constant, (len(values), constant.shape[-1])))
-    for index, column in enumerate(columns):
+    for index, column in columns:
         total += column * values[:, index, None]
     return total
 
