@@ -71,6 +71,7 @@ def evaluate_program(
     seed: int = 0,
     max_steps: int | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
+    watch: Callable[[NDArray[np.float64], NDArray[np.int64]], None] | None = None,
 ) -> list[Evaluation]:
     """Run a program on variations of an environment.
 
@@ -85,6 +86,7 @@ def evaluate_program(
     :param seed: variation ``i`` is seeded with ``seed + i``
     :param max_steps: cap of an episode in place of the registered one
     :param env_kwargs: constructor arguments common to all variations
+    :param watch: is called at each step with X ``(n_envs, n_inputs)`` and the index of the branch taken ``(n_envs,)``
     :return: one row for each variation
     :raises ValueError: if an argument is not accepted or the program does not fit the environment
     """
@@ -107,7 +109,10 @@ def evaluate_program(
 
         def act(observations: NDArray[Any], rewards: NDArray[np.float32], dones: NDArray[np.bool_]) -> NDArray[Any]:
             nonlocal previous
-            previous = runner.act(join_inputs(program, observations, previous, rewards, dones))
+            inputs = join_inputs(program, observations, previous, rewards, dones)
+            previous = runner.act(inputs)
+            if watch is not None:
+                watch(inputs, runner.branch)
             return previous
 
         return act

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from progpolicy_envs import Domain, get_domain
 from progpolicy_envs.symmetry import Symmetry
+from sb3_progpolicy.analysis.box import Point, Pruned, prune
 from sb3_progpolicy.analysis.integer import MAX_WEIGHT, Solution, fewest_terms
 from sb3_progpolicy.analysis.situations import Situations, meet
 from sb3_progpolicy.analysis.terms import Floats, Term, terms_of
@@ -23,6 +24,8 @@ from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.programs.syntax import Condition, Controller, Expression, IfThenElse, ProgramData
 
 EquallyGood = Literal["program", "planner"]
+#: What is said of a point of a curve.
+CURVE = ("terms", "success_rate", "steps_mean")
 #: How often situations that only the simplified program meets are added.
 _ROUNDS = 8
 
@@ -43,6 +46,7 @@ class Simplification:
     :param exhaustive: whether these are all starts of the training variations
     :param seconds: that it took
     :param notes: what was tried and did not succeed, in sentences
+    :param curve: for Box actions what programs of other numbers of terms reach on the training variations
     """
 
     program: Program
@@ -57,12 +61,13 @@ class Simplification:
     exhaustive: bool
     seconds: float
     notes: tuple[str, ...]
+    curve: tuple[Point, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return all but the program as JSON values."""
-        fields = dataclasses.asdict(dataclasses.replace(self, program=None))  # type: ignore[arg-type]
-        del fields["program"]
-        return {**fields, "notes": list(self.notes)}
+        plain = {name: value for name, value in vars(self).items() if name not in ("program", "curve")}
+        curve = [{name: getattr(point, name) for name in CURVE} for point in self.curve]
+        return {**plain, "notes": list(self.notes), "curve": curve}
 
 
 def count_numbers(program: ProgramData) -> int:
@@ -85,6 +90,10 @@ def simplify(
     n_starts: int = 300,
     time_limit: float = 60.0,
     max_weight: int = MAX_WEIGHT,
+    episodes: int = 30,
+    success_tolerance: float = 0.01,
+    steps_tolerance: float = 0.05,
+    n_terms: int | None = None,
     seed: int = 0,
 ) -> Simplification:
     """Return the program with the fewest whole numbers that makes the same decisions on training variations.
@@ -94,7 +103,12 @@ def simplify(
     that are whole numbers up to ``max_weight``, tied over the domain's symmetries if that is possible, and functions of
     row and column on grids. Recurrent conditions stay as they are.
 
-    :param program: acts in a Discrete space
+    With Box actions no numbers do exactly the same. There terms are added one by one, those first that bring the
+    actions nearest to the original's, fitted by least squares on the states that the original meets and rounded, until
+    success and steps on the training variations are within a tolerance; then those are left out again without which
+    they still are. Branches that never act are dropped.
+
+    :param program: acts in a Discrete space or a Box
     :param env_id: id of a planning domain; by default the one in the program's metadata
     :param variations: to look at; by default those that the domain is trained on
     :param equally_good: ``"program"`` keeps to the program's own actions, ``"planner"`` to those that begin a shortest
@@ -103,6 +117,10 @@ def simplify(
     :param n_starts: starts of each variation that are looked at; drawn where there are more
     :param time_limit: seconds for each rule
     :param max_weight: largest size of a weight
+    :param episodes: with Box actions, of each evaluation, on each variation
+    :param success_tolerance: with Box actions, by how much the share of successes may fall
+    :param steps_tolerance: with Box actions, by what share the steps may rise
+    :param n_terms: with Box actions, take the program of so many terms, good enough or not
     :param seed: of the drawn starts
     :raises ValueError: if an argument is not accepted
     """
@@ -112,10 +130,26 @@ def simplify(
         raise ValueError("the program does not say which environment it is for; give env_id")
     if equally_good not in ("program", "planner"):
         raise unknown("equally_good", equally_good, ("program", "planner"))
-    if program.action.kind != "discrete":
-        raise ValueError(f"{program.action.kind} actions are not accepted here; Discrete ones are")
+    if program.action.kind not in ("discrete", "box"):
+        raise ValueError(f"{program.action.kind} actions are not accepted here; Discrete and Box ones are")
     domain = get_domain(env_id)
     variations = domain.trained if variations is None else variations
+    if program.action.kind == "box":
+        symmetries = domain.symmetries if tie else ()
+        pruned = prune(
+            program,
+            env_id,
+            variations,
+            symmetries,
+            episodes=episodes,
+            success_tolerance=success_tolerance,
+            steps_tolerance=steps_tolerance,
+            n_terms=n_terms,
+            seed=seed,
+        )
+        return _of_pruned(program, pruned, domain, began)
+    if n_terms is not None:
+        raise ValueError(f"n_terms={n_terms} is not accepted for Discrete actions; the fewest are found")
     planner = equally_good == "planner"
     situations = meet(program, env_id, variations, n_starts, planner, seed)
     if not len(situations.inputs):
@@ -163,6 +197,28 @@ def simplify(
         exhaustive=situations.exhaustive,
         seconds=round(time.monotonic() - began, 1),
         notes=tuple(notes),
+    )
+
+
+def _of_pruned(program: ProgramData, pruned: Pruned, domain: Domain, began: float) -> Simplification:
+    symmetry = domain.symmetries[0].name if pruned.tied else None
+    small = pruned.point.program
+    terms = pruned.point.terms or count_numbers(program)
+    simplified = {"from": program_digest(program), "terms": terms, "symmetry": symmetry}
+    return Simplification(
+        program=Program(**{**vars(small), "metadata": {**program.metadata, "simplified": simplified}}),
+        terms_before=count_numbers(program),
+        terms_after=terms,
+        terms_lower_bound=0,
+        tied=pruned.tied,
+        symmetry=symmetry,
+        equally_good="tolerance",
+        situations=pruned.states,
+        starts=pruned.episodes,
+        exhaustive=False,
+        seconds=round(time.monotonic() - began, 1),
+        notes=pruned.notes,
+        curve=pruned.curve,
     )
 
 
