@@ -1,0 +1,198 @@
+"""The same decisions with fewer numbers, and how few there have to be."""
+
+import dataclasses
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from progpolicy_envs import DOMAINS
+from progpolicy_envs.symmetry import group_of
+from sb3_progpolicy import load_pretrained
+from sb3_progpolicy.analysis.integer import fewest_terms
+from sb3_progpolicy.analysis.simplify import count_numbers, simplify
+from sb3_progpolicy.analysis.situations import good_actions, meet
+from sb3_progpolicy.analysis.terms import terms_of
+from sb3_progpolicy.cli import run
+from sb3_progpolicy.evaluation import evaluate_program
+from sb3_progpolicy.programs import Condition, Controller, IfThenElse, ProgramRunner, load_program
+from sb3_progpolicy.programs.io import program_digest
+from tests.analysis.idle import idle
+
+
+@pytest.fixture(scope="module")
+def hanoi():
+    return simplify(load_pretrained("Hanoi-v0"))
+
+
+def test_hanoi_needs_four_terms_in_one_rule_and_no_program_of_its_form_has_fewer(hanoi):
+    assert (hanoi.terms_after, hanoi.terms_lower_bound) == (4, 4)
+    assert hanoi.terms_before == count_numbers(load_pretrained("Hanoi-v0")) == 108
+    assert (hanoi.tied, hanoi.symmetry, hanoi.exhaustive) == (True, "pegs", True)
+    assert (hanoi.situations, hanoi.starts, hanoi.notes) == (54, 24, ())
+    assert count_numbers(hanoi.program) == 4 * 6, "each of the four stands in all six rows"
+
+
+def test_small_program_decides_as_the_original_does_where_it_was_looked_at(hanoi):
+    original = load_pretrained("Hanoi-v0")
+    inputs = meet(original, "Hanoi-v0", DOMAINS["Hanoi-v0"].trained, 100).inputs
+    actions = [ProgramRunner(program, len(inputs)).act(inputs) for program in (original, hanoi.program)]
+    np.testing.assert_array_equal(*actions)
+
+
+def test_margin_is_far_above_what_single_precision_could_change(hanoi):
+    original = load_pretrained("Hanoi-v0")
+    inputs = meet(original, "Hanoi-v0", DOMAINS["Hanoi-v0"].trained, 100).inputs
+    controller = hanoi.program.controllers[0]
+    scores = np.sort(inputs @ np.array(controller.weights).T + np.array(controller.bias))
+    assert (scores[:, -1] - scores[:, -2]).min() >= 0.25
+
+
+def test_without_ties_there_are_more_numbers(hanoi):
+    free = simplify(load_pretrained("Hanoi-v0"), tie=False, time_limit=5)
+    assert free.symmetry is None
+    assert hanoi.terms_after < free.terms_after < 108
+    assert free.terms_lower_bound <= free.terms_after
+
+
+def test_where_it_comes_from_is_in_the_file(hanoi, tmp_path):
+    hanoi.program.save(tmp_path / "small.json")
+    kept = load_program(tmp_path / "small.json").metadata
+    assert kept["env"] == "Hanoi-v0"
+    assert kept["simplified"] == {
+        "from": program_digest(load_pretrained("Hanoi-v0")),
+        "terms": 4,
+        "terms_lower_bound": 4,
+        "symmetry": "pegs",
+        "equally_good": "program",
+    }
+
+
+def test_stacking_is_one_rule_of_row_and_column_in_the_planners_steps():
+    found = simplify(load_pretrained("Stacking-v0"), equally_good="planner", n_starts=60)
+    assert (found.terms_after, found.terms_lower_bound, found.symmetry) == (3, 3, "table")
+    assert found.program.metadata["grids"] == [{"name": "table", "start": 0, "rows": 5, "columns": 5}]
+    (controller,) = found.program.controllers
+    for row in np.array(controller.weights)[:, :25].reshape(5, 5, 5):
+        steps = [np.diff(row, axis=axis) for axis in (0, 1)]
+        assert all((step == step[0, 0]).all() for step in steps), "an affine function of row and column"
+    for result in evaluate_program(found.program, variations=DOMAINS["Stacking-v0"].trained, n_episodes=30):
+        assert result.ratio == 1
+
+
+def test_planner_names_all_actions_that_begin_a_shortest_solution():
+    env = gym.make_vec("Stacking-v0", num_envs=1, vectorization_mode="vector_entry_point").unwrapped
+    states = [
+        {"n_plates": 1, "plates": [[1, 3]], "gripper": [2, 2]},
+        {"n_plates": 1, "plates": [[2, 2]], "gripper": [2, 2]},
+        {"n_plates": 2, "plates": [[4, 2], [0, 0]], "gripper": [2, 2]},
+    ]
+    assert good_actions(states, env).tolist() == [
+        [True, True, False, False, False], [False, False, False, False, True], [False, False, True, False, False],
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("env_id", ["Hanoi-v0", "Stacking-v0", "HikingEgo-v0", "PandaReach-v0"])
+def test_what_terms_add_is_the_same_from_all_sides(env_id):
+    domain, program = DOMAINS[env_id], idle(env_id, interaction=True)
+    n_outputs = program.action.n_outputs
+    terms = terms_of(program, n_outputs, domain.symmetries, domain.grids)
+    rng = np.random.default_rng(0)
+    observation, history = rng.normal(size=program.n_observations), rng.normal(size=n_outputs)
+    for symmetry in group_of(domain.symmetries):
+        x = np.concatenate([observation, history, [0.3, 0, 1]])
+        twin = np.concatenate([symmetry.observation(observation), symmetry.action(history), [0.3, 0, 1]])
+        for term in terms:
+            np.testing.assert_allclose(term.weights @ twin, symmetry.action(term.weights @ x), atol=1e-9)
+
+
+def with_a_condition(program, threshold):
+    """Two copies of a program's controller, of which one is reached while the first peg is empty."""
+    (controller,) = program.controllers
+    readout = [0.0] * program.n_inputs
+    readout[program.input_names.index("empty[0]")] = 3.7
+    condition = Condition("affine", (), (), (), (), tuple(readout), threshold)
+    return dataclasses.replace(program, body=IfThenElse(condition, controller, controller))
+
+
+def test_conditions_become_small_too_and_each_branch_is_looked_at_for_itself():
+    found = simplify(with_a_condition(load_pretrained("Hanoi-v0"), -1.3), tie=False, time_limit=3)
+    (condition,) = found.program.conditions
+    assert np.count_nonzero(condition.readout) + (condition.readout_bias != 0) == 2
+    assert set(condition.readout) <= set(range(-8, 9))
+    for row in evaluate_program(found.program, variations=DOMAINS["Hanoi-v0"].trained):
+        assert row.ratio == 1
+
+
+def test_branches_that_never_act_are_dropped():
+    found = simplify(with_a_condition(load_pretrained("Hanoi-v0"), -100.0))
+    assert found.program.conditions == ()
+    assert found.terms_after == 4
+
+
+def test_recurrent_conditions_stay_and_it_is_said(hanoi):
+    program = hanoi.program
+    cell = Condition("rnn", ((0.1,) * 17,), ((0.5,),), (0.0,), (0.0,), (1.0,), -9.0)
+    recurrent = dataclasses.replace(program, body=IfThenElse(cell, program.controllers[0], program.controllers[0]))
+    found = simplify(recurrent)
+    assert found.program.conditions == (cell,)
+    assert "condition 1 has a memory and stays as it is" in found.notes
+
+
+def test_where_no_rule_is_found_the_original_stays_and_it_is_said():
+    program = load_pretrained("Hanoi-v0")
+    rng = np.random.default_rng(0)
+    controller = Controller(tuple(map(tuple, rng.normal(size=(6, 17)).tolist())), tuple(rng.normal(size=6).tolist()))
+    found = simplify(dataclasses.replace(program, body=controller), max_weight=1, time_limit=1)
+    assert found.notes[0].startswith("controller 1: no tied rule of whole numbers up to 1 was found")
+    assert found.symmetry is None
+    assert found.program.body == controller
+    assert found.terms_after == 6 * 18
+    assert found.terms_lower_bound <= found.terms_after
+
+
+def test_box_actions_keep_success_and_steps_within_the_tolerance():
+    program = load_pretrained("PandaReach-v0")
+    found = simplify(program, variations=[{"n_targets": 1}, {"n_targets": 3}], episodes=6)
+    assert found.terms_after <= 8
+    assert found.symmetry == "mirror"
+    assert [point.terms for point in found.curve] == sorted(point.terms for point in found.curve)
+    both = [evaluate_program(one, variations=[{"n_targets": 2}], n_episodes=5)[0] for one in (program, found.program)]
+    assert both[1].success_rate == 1
+    assert both[1].steps_mean <= 1.3 * both[0].steps_mean
+
+
+def test_fewest_terms_are_found_with_their_bound():
+    # x > 0 and y > 0 have to be told from a third number that says both, and noise.
+    rng = np.random.default_rng(0)
+    both = rng.normal(size=(200, 1))
+    rows = np.hstack([both + 1 + np.abs(both), rng.normal(size=(200, 3))])
+    solution = fewest_terms(rows, 10)
+    assert (solution.n_terms, solution.lower_bound) == (1, 1)
+    assert solution.weights[0] == 1
+    assert fewest_terms(np.array([[1.0, 0.0], [-1.0, 0.0]]), 5) is None
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    ({"equally_good": "teacher"}, "equally_good.*'teacher'.*program, planner"),
+    ({"n_terms": 3}, "n_terms=3 is not accepted for Discrete"),
+    ({"env_id": "Hanoi-v9"}, "Hanoi-v9"),
+    ({"env_id": "Stacking-v0"}, "reads 9 numbers.*has 35"),
+])  # fmt: skip
+def test_arguments_are_checked(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        simplify(load_pretrained("Hanoi-v0"), **arguments)
+
+
+def test_command_writes_the_program_and_says_what_it_costs(tmp_path, capsys):
+    small = tmp_path / "small.json"
+    assert run(["simplify", "Hanoi-v0", "-o", str(small), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["terms_before"], found["terms_after"], found["terms_lower_bound"]) == (108, 4, 4)
+    assert found["evaluation"][-1]["steps_mean_after"] == 255
+    assert run(["simplify", str(small)]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "24 numbers before, 4 terms now, one rule for all pegs; no program of this form has fewer" in out
+    assert run(["simplify", "Hanoi-v0", "-o", str(tmp_path / "small.txt")]) == 2
+    assert ".json" in capsys.readouterr().err

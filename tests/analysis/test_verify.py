@@ -1,0 +1,136 @@
+"""What a program does from every start."""
+
+import dataclasses
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from progpolicy_envs import DOMAINS
+from sb3_progpolicy import load_pretrained
+from sb3_progpolicy.analysis.simplify import simplify
+from sb3_progpolicy.analysis.verify import success_bound, verify
+from sb3_progpolicy.cli import run
+from sb3_progpolicy.programs import ProgramRunner, join_inputs
+from sb3_progpolicy.programs.io import program_digest
+from tests.analysis.idle import idle
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    path = tmp_path_factory.mktemp("small") / "small.json"
+    simplify(load_pretrained("Hanoi-v0")).program.save(path)
+    return str(path)
+
+
+def test_four_terms_are_optimal_from_all_pegs_with_up_to_twelve_discs(small, capsys):
+    assert run(["verify", small, "--set", "n_discs=1-12", "--all-starts", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert [row["variation"] for row in rows] == [{"n_discs": n} for n in range(1, 13)]
+    assert all((row["starts"], row["solved"], row["optimal"], row["worst_ratio"]) == (6, 6, 6, 1.0) for row in rows)
+    assert all(row["exhaustive"] and row["counterexample"] is None and row["success_bound"] is None for row in rows)
+
+
+def play(program, env_id, reset, cap=2000):
+    """Run an episode in the single environment and return its steps, or ``None``."""
+    env = gym.make(env_id, max_episode_steps=cap)
+    observation, _ = env.reset(**reset)
+    runner, previous, reward = ProgramRunner(program), None, 0.0
+    for step in range(1, cap + 1):
+        previous = runner.act(join_inputs(program, observation, previous, np.float32(reward), False))
+        observation, reward, terminated, _, _ = env.step(previous[0])
+        if terminated:
+            return step
+    return None
+
+
+def test_counterexample_is_a_reset_that_fails_and_the_shortest(small, capsys, tmp_path):
+    film = tmp_path / "failure.gif"
+    arguments = ["verify", small, "--set", "n_discs=4", "--from-any-state"]
+    assert run([*arguments, "--json", "-o", str(film)]) == 1
+    (row,) = json.loads(capsys.readouterr().out)
+    assert row["starts"] == 6 * 81
+    assert row["solved"] < row["starts"]
+    program = (
+        load_pretrained("Hanoi-v0") if small is None else __import__("sb3_progpolicy").programs.load_program(small)
+    )
+    assert play(program, "Hanoi-v0", row["counterexample"]) is None
+    assert film.read_bytes()[:4] == b"GIF8"
+    assert run(arguments) == 1
+    assert '"discs": [' in capsys.readouterr().out
+
+
+def test_batched_runs_are_those_of_single_environments():
+    program = load_pretrained("Stacking-v0")
+    (row,) = verify(program, variations=[{"n_plates": 1}])
+    assert (row.starts, row.exhaustive) == (625, True)
+    venv = gym.make_vec("Stacking-v0", num_envs=625, vectorization_mode="vector_entry_point").unwrapped
+    venv.reset_to({"n_plates": 1}, np.arange(625))
+    optimal = venv.optimal_steps()
+    steps = [play(program, "Stacking-v0", {"options": venv.state_of(i)}) for i in range(0, 625, 25)]
+    assert row.solved == 625
+    assert row.worst_ratio >= max(step / best for step, best in zip(steps, optimal[::25], strict=True))
+
+
+def test_too_many_starts_are_drawn_and_the_share_has_a_bound():
+    (row,) = verify(load_pretrained("Stacking-v0"), variations=[{"n_plates": 8}], n_starts=200)
+    assert (row.starts, row.exhaustive) == (200, False)
+    assert row.solved == 200
+    assert row.success_bound == pytest.approx(0.05 ** (1 / 200))
+
+
+def test_physics_is_tested_and_not_verified(capsys):
+    assert run(["verify", "PandaReach-v0", "--set", "n_targets=1", "--starts", "3"]) == 0
+    out = capsys.readouterr().out
+    assert "tested on drawn starts" in out
+    assert "every start" not in out
+    assert run(["verify", "PandaReach-v0", "--set", "n_targets=1", "--all-starts"]) == 2
+    assert "cannot be counted" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("solved", "starts", "bound"), [(0, 10, 0.0), (10, 10, 0.05**0.1), (50, 100, 0.4136)])
+def test_bound_is_that_of_clopper_and_pearson(solved, starts, bound):
+    assert success_bound(solved, starts) == pytest.approx(bound, abs=1e-3)
+
+
+def test_certificate_names_program_versions_and_command(small, tmp_path, capsys):
+    path = tmp_path / "certificate.json"
+    assert run(["verify", small, "--set", "n_discs=1,2", "-o", str(path)]) == 0
+    written = json.loads(path.read_text())
+    assert set(written) == {"program", "env", "command", "versions", "rows"}
+    assert written["env"] == "Hanoi-v0"
+    assert len(written["rows"]) == 2
+    assert len(written["program"]) == 16
+    assert "every start" in capsys.readouterr().out
+
+
+def test_digest_tells_programs_apart_and_looks_away_from_metadata():
+    programs = [load_pretrained(name) for name in ("Hanoi-v0", "Stacking-v0")]
+    assert len({program_digest(program) for program in programs}) == 2
+    assert program_digest(dataclasses.replace(programs[0], metadata={"a": 1})) == program_digest(programs[0])
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    ({"n_starts": 0}, "n_starts=0"),
+    ({"n_starts": 5, "all_starts": True}, "not accepted together"),
+    ({"from_any_state": True, "env_id": "Stacking-v0"}, "reads 9 numbers"),
+    ({"variations": [{"n_discs": 40}]}, "n_discs=40"),
+])  # fmt: skip
+def test_arguments_are_checked(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        verify(load_pretrained("Hanoi-v0"), **arguments)
+
+
+def test_states_that_no_domain_counts_are_named():
+    with pytest.raises(ValueError, match="legal states cannot be counted"):
+        verify(load_pretrained("PandaReach-v0"), from_any_state=True)
+    with pytest.raises(ValueError, match=r"states of .* cannot be counted"):
+        verify(load_pretrained("Stacking-v0"), variations=[{"n_plates": 1}], from_any_state=True)
+
+
+def test_maps_that_are_drawn_are_sampled():
+    domain = DOMAINS["Hiking-v0"]
+    assert domain.simulation is False
+    (row,) = verify(idle("Hiking-v0"), "Hiking-v0", [{"n_stars": 1, "layout": "random"}], n_starts=4, max_steps=20)
+    assert (row.starts, row.exhaustive) == (4, False)
