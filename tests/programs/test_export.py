@@ -14,6 +14,7 @@ from sb3_progpolicy.programs import (
     Condition,
     Controller,
     ProgramRunner,
+    export_c,
     export_graphviz,
     export_latex,
     export_python,
@@ -266,7 +267,7 @@ def test_latex_gives_every_matrix():
     assert r"\text{move 0-\textgreater{}1}" in source
 
 
-@pytest.mark.parametrize("export", [export_graphviz, export_latex, export_python])
+@pytest.mark.parametrize("export", [export_c, export_graphviz, export_latex, export_python])
 def test_out_file_may_be_a_path_or_an_open_file(export, tmp_path):
     program, buffer, path = hanoi_program(), io.StringIO(), tmp_path / "out"
     assert export(program, buffer) is None
@@ -274,7 +275,7 @@ def test_out_file_may_be_a_path_or_an_open_file(export, tmp_path):
     assert buffer.getvalue() == path.read_text(encoding="utf-8") == export(program)
 
 
-@pytest.mark.parametrize("export", [export_text, export_graphviz, export_latex, export_python, plot_program])
+@pytest.mark.parametrize("export", [export_c, export_text, export_graphviz, export_latex, export_python, plot_program])
 def test_malformed_program_is_refused(export):
     broken = replace(hanoi_program(), output_names=("a\nimport os",) * 6)
     with pytest.raises(ValueError, match="output_names"):

@@ -201,7 +201,7 @@ import sys, matplotlib
 matplotlib.use("Agg")
 from sb3_progpolicy.programs import *
 program = load_program(sys.argv[1])
-for export in (export_text, export_graphviz, export_latex, export_python, plot_program):
+for export in (export_c, export_text, export_graphviz, export_latex, export_python, plot_program):
     export(program)
 """
 
