@@ -3,16 +3,21 @@ import io
 import re
 import subprocess
 import sys
+import textwrap
 from dataclasses import replace
 
 import matplotlib
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from sb3_progpolicy.programs import (
+    ActionSpec,
     Condition,
     Controller,
+    IfThenElse,
+    Program,
     ProgramRunner,
     export_c,
     export_graphviz,
@@ -22,7 +27,7 @@ from sb3_progpolicy.programs import (
     join_inputs,
     plot_program,
 )
-from tests.programs.strategies import CELLS, build_program, hanoi_program, programs, random_actions, seeds
+from tests.programs.strategies import CELLS, build_program, hanoi_program, programs, random_actions, seeds, sparse
 
 matplotlib.use("Agg")
 
@@ -47,9 +52,10 @@ def load_policy(source):
 # Python
 
 
-@given(program=programs, seed=seeds)
-@settings(max_examples=80, deadline=None)
-def test_exported_python_takes_the_same_actions_as_the_runner(program, seed):
+@given(program=programs, seed=seeds, few_terms=st.booleans())
+@settings(max_examples=120, deadline=None)
+def test_exported_python_takes_the_same_actions_as_the_runner(program, seed, few_terms):
+    program = sparse(program, seed) if few_terms else program
     rng = np.random.default_rng(seed)
     policy, runner = load_policy(export_python(program)), ProgramRunner(program)
     given_action, reward, done = None, 0.0, False
@@ -62,6 +68,7 @@ def test_exported_python_takes_the_same_actions_as_the_runner(program, seed):
         expected = runner.act(join_inputs(program, observation, given_action, reward, done))[0]
         action = policy.act(observation, None if given_action is None else given_action[0], reward, done)
         if program.action.kind == "box":
+            assert all(type(number) is float for number in action)
             action = np.float32(action)
         np.testing.assert_array_equal(action, expected)
         given_action = random_actions(rng, program.action, 1)
@@ -127,6 +134,45 @@ def test_exported_source_has_the_branches_and_names_of_the_program():
     assert branches == ["if b1 >= 0.0:", "elif b2 >= 0.0:", "else:"]
     assert "# colour_0: colour[0]" in source
     assert "# previous move 0->1" in source
+
+
+def program_by_hand(weight=-1.0):
+    """Three moves of a cart: away from the left wall, else by the angle, never right after moving left."""
+    nothing = (0.0,) * 9
+    near = Condition("affine", (), (), (), (), (-2.0, *(0.0,) * 8), 1.0)
+    lean = (0.0, weight, 0.0, 0.0, -5.0, 0.0, 0.0, 0.0, 0.0)
+    body = IfThenElse(
+        near,
+        Controller((nothing,) * 3, (0.0, 0.0, 1.0)),
+        Controller((lean, nothing, (0.0, 3.0, *(0.0,) * 7)), (0.0, 2.0, -1.0)),
+    )
+    moves = ("left", "stay", "right")
+    names = ("position", "angle[0]", "wind", "light", *(f"previous {move}" for move in moves))
+    names = (*names, "previous reward", "previous done")
+    return Program(body, 4, ActionSpec("discrete", (3,)), True, names, moves, metadata={"env": "Cart-v0"})
+
+
+def test_python_of_a_program_with_few_terms_is_what_a_person_would_have_written():
+    source = export_python(program_by_hand())
+    body = source.partition("are accepted")[2].partition("\n")[2]
+    assert textwrap.dedent(body) == (
+        "position = float(observation[0])\n"
+        "angle_0 = float(observation[1])  # angle[0]\n"
+        "action = -1 if previous_action is None else int(previous_action)\n"
+        "if action >= 3 or action < 0 and previous_action is not None:\n"
+        '    raise ValueError("previous_action=%r is not accepted; 0 to 2 is" % (previous_action,))\n'
+        "previous_left = action == 0  # previous left\n"
+        "\n"
+        "if 1 - 2 * position >= 0:\n"
+        "    return 2  # right\n"
+        "else:\n"
+        "    # Controller 2\n"
+        "    left = -angle_0 - 5 * previous_left\n"
+        "    stay = 2\n"
+        "    right = -1 + 3 * angle_0\n"
+        "    scores = (left, stay, right)\n"
+        "    return scores.index(max(scores))\n"
+    )
 
 
 def test_exported_sum_of_thousands_of_terms_still_compiles():

@@ -36,7 +36,7 @@ from sb3_progpolicy.programs.validation import (
 )
 from tests.programs.formats import check_python, plain_tree
 from tests.programs.hostile import PIECES, with_hostile_texts
-from tests.programs.strategies import build_program, hanoi_program, small_program
+from tests.programs.strategies import build_program, hanoi_program, small_program, sparse
 
 matplotlib.use("Agg")
 
@@ -62,6 +62,7 @@ def test_no_text_of_a_program_adds_a_node_to_the_exported_python():
     rng = np.random.default_rng(0)
     for _ in range(200):
         program = small_program(rng)
+        program = sparse(program, 0) if rng.random() < 0.5 else program
         expected = plain_tree(program)
         for _ in range(10):
             check_python(with_hostile_texts(program, rng), expected)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
@@ -65,6 +66,26 @@ def largest_terms(weights: Sequence[float], names: Sequence[str], decimals: int,
     terms = sorted(((weight, name) for weight, name in zip(weights, names, strict=True) if weight), key=_by_size)
     shown = [term for term in terms if round(term[0], decimals)][:max_terms]
     return Terms(tuple(shown), len(terms) - len(shown))
+
+
+def is_whole(value: float) -> bool:
+    """Whether a number is printed without a point: a whole one of up to nine digits."""
+    return math.isfinite(value) and abs(value) < 1e9 and value == int(value)
+
+
+def has_whole_numbers(program: ProgramData) -> bool:
+    """Whether all weights and constants of a program are whole, as those of one written by hand often are."""
+    return all(
+        is_whole(value)
+        for rows in (
+            *((*condition.weight_ih, *condition.weight_hh) for condition in program.conditions),
+            *((condition.bias_ih, condition.bias_hh, condition.readout) for condition in program.conditions),
+            *((*controller.weights, controller.bias) for controller in program.controllers),
+            [[condition.readout_bias for condition in program.conditions]],
+        )
+        for row in rows
+        for value in row
+    )
 
 
 def _by_size(term: tuple[float, str]) -> float:
