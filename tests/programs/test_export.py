@@ -217,6 +217,42 @@ def test_text_of_a_small_program_reads_like_this():
     assert str(program) == export_text(program)
 
 
+def test_whole_numbers_are_printed_without_a_point_where_all_are_whole():
+    assert export_text(program_by_hand()).partition("\n\n")[2] == (
+        "if B1 >= 0:\n"
+        "    left  = 0\n"
+        "    stay  = 0\n"
+        "    right = 1\n"
+        "else:\n"
+        "    left  = -5*[previous left] - angle[0]\n"
+        "    stay  = 2\n"
+        "    right = -1 + 3*angle[0]\n"
+        "\n"
+        "B1 = 1 - 2*position\n"
+    )
+    assert "left = 0  -5 previous left  -angle[0]\\l" in export_graphviz(program_by_hand())
+    assert "0 & -1 & 0 & 0 & -5 & 0" in export_latex(program_by_hand())
+    assert "    left  = -5.00*[previous left] - 0.50*angle[0]\n" in export_text(program_by_hand(-0.5))
+    assert "3.00*angle[0]" in export_text(program_by_hand(-0.5))
+
+
+def test_every_print_counts_what_it_leaves_out_or_shows_that_it_is_there():
+    program = program_by_hand(-0.001)
+    assert "left  = -5.00*[previous left] + (1 smaller term)" in export_text(program)
+    assert "left = 0  -5.00 previous left  (1 smaller term)" in export_graphviz(program)
+    assert "0 & 0.00 & 0 & 0 & -5.00" in export_latex(program)
+    axes = plot_program(program)
+    assert "… 1" in [text.get_text() for text in axes.texts]
+    matplotlib.pyplot.close(axes.figure)
+    assert "smaller" not in export_text(program, decimals=3)
+
+
+def test_name_that_is_a_number_is_not_read_as_one():
+    program = replace(program_by_hand(), input_names=("1", "7", *"abcdefg"))
+    assert "B1 = 1 - 2*[1]" in export_text(program)
+    assert " - [7]\n" in export_text(program)
+
+
 def test_text_shows_structure_and_memory():
     text = export_text(hanoi_program())
     headings = re.findall(r"^(\S.*:)$", text, flags=re.MULTILINE)

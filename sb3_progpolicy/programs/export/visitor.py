@@ -88,6 +88,26 @@ def has_whole_numbers(program: ProgramData) -> bool:
     )
 
 
+class Decimals:
+    """Numbers as people read them: rounded, or without a point where all of the program's are whole.
+
+    :param program: whose numbers are printed
+    :param decimals: digits after the point
+    """
+
+    def __init__(self, program: ProgramData, decimals: int) -> None:
+        self.digits = 0 if has_whole_numbers(program) else decimals
+
+    def __call__(self, value: float) -> str:
+        """Print a number; one that is not zero but rounds to it is 0.00, and zero itself is 0."""
+        shown = round(value, self.digits) or 0.0  # no "-0.00"
+        return f"{shown:.{self.digits}f}" if value else "0"
+
+    def factor(self, weight: float, between: str) -> str:
+        """Print the size of a weight before a name, nothing for the whole number 1."""
+        return "" if self.digits == 0 and abs(weight) == 1 else f"{self(abs(weight))}{between}"
+
+
 def _by_size(term: tuple[float, str]) -> float:
     return -abs(term[0])
 
