@@ -13,7 +13,8 @@ library (``predict`` of SB3 and scikit-learn, one observation a call) and of the
 ``mul_add``: multiplications and additions of a decision, at most; tanh is not counted, the network has 128.
 ``comparisons``: of the largest score, the bounds and the conditions; of a tree, of the mean path.
 ``saved_bytes``: the program's JSON, SB3's ``policy.save`` (which holds the critic, too), scikit-learn's pickle.
-``success``: crisp, on the training variations, on starts that the tree was not fitted to. An untrained network has
+``success``: crisp, on the training variations, on starts that the tree was not fitted to; ``unseen_success``: on the
+larger variations that no training sees. An untrained network has
 none: its sizes and times are those of a trained one. ``--mlp`` gives a trained one.
 
 Writes ``benchmarks/results/sizes.csv`` and a ``.json`` with command, commit and versions. Needs the extra ``sizes``.
@@ -45,14 +46,14 @@ from study import write_results
 
 from progpolicy_envs import DOMAINS
 from sb3_progpolicy import load_pretrained, make_fast_vec_env, pretrained_names
-from sb3_progpolicy.evaluation import evaluate_model, evaluate_program
+from sb3_progpolicy.evaluation import Evaluation, evaluate_model, evaluate_program
 from sb3_progpolicy.interaction import VecInteractionHistory
 from sb3_progpolicy.programs import Program, ProgramRunner, export_c, export_python
 from sb3_progpolicy.spaces import ActionSpec
 
 COLUMNS = (
     "env", "policy", "numbers", "saved_bytes", "python_bytes", "mul_add", "comparisons", "python_us", "c_us",
-    "library_us", "success", "episodes",
+    "library_us", "success", "unseen_success", "episodes",
 )  # fmt: skip
 DEPTH = 8
 DISTILLATION_SEED, EVALUATION_SEED = 0, 10_000
@@ -252,13 +253,22 @@ def c_microseconds(program: Program, x: Floats, rounds: int) -> float | None:
 # The three policies
 
 
+def success(env_id: str, evaluate: Callable[[Any], list[Evaluation]]) -> Row:
+    """Return the share of episodes solved on the training and on the unseen variations."""
+    domain = DOMAINS[env_id]
+    sets = {"success": domain.train, "unseen_success": domain.unseen}
+    return {
+        name: round(float(np.mean([row.success_rate for row in evaluate(variations)])), 4)
+        for name, variations in sets.items()
+    }
+
+
 def measure_program(program: Program, env_id: str, x: Floats, options: argparse.Namespace) -> Row:
     """Return the row of the program."""
     source = str(export_python(program))
     policy = loaded(source)["ProgramPolicy"]()
     observations = x[:, : program.n_observations].tolist()
     steps = list(zip(observations, history(program, x), x[:, -2].tolist(), x[:, -1].tolist(), strict=True))
-    results = evaluate_program(program, env_id, DOMAINS[env_id].train, options.episodes, seed=EVALUATION_SEED)
     with tempfile.TemporaryDirectory() as folder:
         program.save(Path(folder) / "program.json")
         saved = (Path(folder) / "program.json").stat().st_size
@@ -272,7 +282,10 @@ def measure_program(program: Program, env_id: str, x: Floats, options: argparse.
         "comparisons": comparisons,
         "python_us": microseconds(lambda step: policy.act(*step), steps, options.rounds),
         "c_us": c_microseconds(program, np.tile(x, (20, 1)), options.rounds),
-        "success": round(float(np.mean([row.success_rate for row in results])), 4),
+        **success(
+            env_id,
+            lambda variations: evaluate_program(program, env_id, variations, options.episodes, seed=EVALUATION_SEED),
+        ),
     }
 
 
@@ -285,10 +298,11 @@ def measure_mlp(program: Program, env_id: str, x: Floats, venv: Any, options: ar
     layers = [(m.weight.detach().numpy(), m.bias.detach().numpy()) for m in linear]
     width = layers[0][0].shape[1]  # a network given may read the observation alone
     source = unfolded_mlp(layers, program.action)
-    success = None
+    evaluated = {}
     if path:
-        results = evaluate_model(model, env_id, DOMAINS[env_id].train, options.episodes, EVALUATION_SEED)
-        success = round(float(np.mean([row.success_rate for row in results])), 4)
+        evaluated = success(
+            env_id, lambda variations: evaluate_model(model, env_id, variations, options.episodes, EVALUATION_SEED)
+        )
     with tempfile.TemporaryDirectory() as folder:
         policy.save(Path(folder) / "policy.pth")
         saved = (Path(folder) / "policy.pth").stat().st_size
@@ -302,7 +316,7 @@ def measure_mlp(program: Program, env_id: str, x: Floats, venv: Any, options: ar
         "comparisons": choice_comparisons(program.action),
         "python_us": microseconds(loaded(source)["act"], x[:200, :width].tolist(), options.rounds),
         "library_us": microseconds(lambda row: model.predict(row, deterministic=True), inputs[:200], options.rounds),
-        "success": success,
+        **evaluated,
     }
 
 
@@ -319,11 +333,10 @@ def measure_tree(program: Program, env_id: str, space: Any, options: argparse.Na
         return tree.predict(given).astype(actions.dtype), state
 
     player: Any = Player(space, choose)
-    results = evaluate_model(player, env_id, DOMAINS[env_id].train, options.episodes, EVALUATION_SEED)
     inner = tree.tree_
     thresholds = inner.threshold[inner.children_left >= 0]
     return {
-        "policy": f"decision tree, depth {DEPTH}, {tree.get_n_leaves()} leaves",
+        "policy": f"tree, depth {DEPTH}, {tree.get_n_leaves()} leaves",
         "numbers": count_nonzero(thresholds) + tree.get_n_leaves() * (program.action.n_outputs if box else 1),
         "saved_bytes": len(pickle.dumps(tree)),
         "python_bytes": len(source.encode()),
@@ -331,7 +344,9 @@ def measure_tree(program: Program, env_id: str, space: Any, options: argparse.Na
         "comparisons": round(float(tree.decision_path(x).sum(axis=1).mean()) - 1, 1),
         "python_us": microseconds(act, x[:2_000].tolist(), options.rounds),
         "library_us": microseconds(tree.predict, [row[None] for row in x[:200]], options.rounds),
-        "success": round(float(np.mean([row.success_rate for row in results])), 4),
+        **success(
+            env_id, lambda variations: evaluate_model(player, env_id, variations, options.episodes, EVALUATION_SEED)
+        ),
     }
 
 
@@ -358,13 +373,14 @@ def measure(env_id: str, options: argparse.Namespace) -> list[Row]:
 def print_table(rows: list[Row]) -> None:
     """Print the rows, with what an empty cell means."""
     titles = ("task", "policy", "numbers", "bytes", "Python bytes", "mul, add", "compare", "Python µs", "C µs",
-              "library µs", "success")  # fmt: skip
-    table = Table(*titles, caption="success: crisp, on the training variations; empty for an untrained network")
+              "library µs", "success", "unseen")  # fmt: skip
+    table = Table(
+        *titles, caption="success: crisp, on the training and on unseen variations; empty for an untrained network"
+    )
     for row in rows:
         cells = ["" if row.get(column) is None else str(row[column]) for column in COLUMNS[: len(titles)]]
-        if row.get("success") is not None:
-            cells[-1] = f"{row['success']:.1%}"
-        table.add_row(*cells, end_section=row["policy"].startswith("decision"))
+        cells[-2:] = [f"{row[name]:.1%}" if name in row else "" for name in ("success", "unseen_success")]
+        table.add_row(*cells, end_section=row["policy"].startswith("tree"))
     Console(width=150).print(table)
 
 
