@@ -55,7 +55,11 @@ def train(env_id: str, seed: int, folder: Path, overrides: dict[str, Any]) -> Pr
 
 
 def write_results(
-    name: str, columns: Sequence[str], rows: Sequence[Mapping[str, Any]], overrides: Mapping[str, Any]
+    name: str,
+    columns: Sequence[str],
+    rows: Sequence[Mapping[str, Any]],
+    overrides: Mapping[str, Any],
+    packages: Sequence[str] = (),
 ) -> None:
     """Write ``results/<name>.csv`` and a ``.json`` with the command, the commit and the versions that made it.
 
@@ -63,6 +67,7 @@ def write_results(
     :param columns: of the table
     :param rows: of the table
     :param overrides: hyperparameters in place of the shipped ones
+    :param packages: whose versions are named beside those of the usual ones
     """
     RESULTS.mkdir(exist_ok=True)
     table = io.StringIO()
@@ -75,6 +80,9 @@ def write_results(
         "command": " ".join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]]),
         "commit": commit,
         "overrides": overrides,
-        "versions": {"python": platform.python_version(), **{package: version(package) for package in _PACKAGES}},
+        "versions": {
+            "python": platform.python_version(),
+            **{package: version(package) for package in (*_PACKAGES, *packages)},
+        },
     }
     write_atomically(RESULTS / f"{name}.json", json.dumps(origin, indent=2) + "\n")

@@ -130,7 +130,8 @@ def test_run_model_and_program_are_the_same_source(trained, capsys):
 
 
 @pytest.mark.parametrize(
-    ("format_", "start"), [("text", "Program"), ("latex", "cases"), ("dot", "digraph"), ("python", '"""')]
+    ("format_", "start"),
+    [("text", "Program"), ("latex", "cases"), ("dot", "digraph"), ("python", '"""'), ("c", "hanoi_v0_act(")],
 )
 def test_show_prints_every_format(format_, start, program, tmp_path, capsys):
     assert run(["show", program, "--format", format_]) == 0
@@ -138,6 +139,23 @@ def test_show_prints_every_format(format_, start, program, tmp_path, capsys):
     assert run(["show", program, "--format", format_, "-o", str(tmp_path / "out")]) == 0
     assert (tmp_path / "out").read_text() == printed
     assert start in printed
+
+
+def test_show_writes_an_onnx_model_and_a_c_header_as_the_file_is_named(program, tmp_path, monkeypatch):
+    onnx = pytest.importorskip("onnx")
+    monkeypatch.chdir(tmp_path)
+    assert run(["show", program, "--format", "onnx"]) == 0
+    assert run(["show", program, "-o", "again.onnx"]) == 0
+    assert (tmp_path / "Hanoi-v0.onnx").read_bytes() == (tmp_path / "again.onnx").read_bytes()
+    onnx.checker.check_model(onnx.load("again.onnx"))
+    assert run(["show", program, "-o", "program.h"]) == 0
+    assert "#include <math.h>" in (tmp_path / "program.h").read_text()
+
+
+def test_show_says_what_an_onnx_model_needs(program, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    assert run(["show", program, "--format", "onnx"]) == 2
+    assert 'pip install "sb3-progpolicy[onnx]"' in capsys.readouterr().err
 
 
 def test_show_draws(program, tmp_path, monkeypatch):

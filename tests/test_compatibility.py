@@ -54,10 +54,10 @@ for name in ("torch", "stable_baselines3", "sb3_contrib"):
     sys.modules[name] = None
 import numpy as np
 from sb3_progpolicy import load_pretrained, spaces
-from sb3_progpolicy.programs import ProgramRunner, export_graphviz, export_latex, export_python, export_text
+from sb3_progpolicy.programs import ProgramRunner, export_c, export_graphviz, export_latex, export_python, export_text
 program = load_pretrained("Hanoi-v0")
 assert ProgramRunner(program).act(np.zeros((1, program.n_inputs))).shape == (1,)
-assert all(export(program) for export in (export_text, export_python, export_latex, export_graphviz))
+assert all(export(program) for export in (export_text, export_python, export_c, export_latex, export_graphviz))
 assert str(program) == export_text(program)
 """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -16,8 +16,10 @@ from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.programs.files import write_atomically
 from sb3_progpolicy.programs.program import Program
 
-FORMATS = ("text", "latex", "dot", "python", "png")
-_OF_SUFFIX = {".txt": "text", ".tex": "latex", ".dot": "dot", ".py": "python", ".png": "png"}
+FORMATS = ("text", "latex", "dot", "python", "c", "png", "onnx")
+_OF_SUFFIX = {
+    ".txt": "text", ".tex": "latex", ".dot": "dot", ".py": "python", ".h": "c", ".png": "png", ".onnx": "onnx",
+}  # fmt: skip
 
 
 def show(
@@ -26,11 +28,11 @@ def show(
         str | None, typer.Option("--format", help=f"{', '.join(FORMATS)}; by default as the file's name ends, or text")
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="file to write; png: <environment>.png by default")
+        Path | None, typer.Option("-o", "--output", help="file to write; png, onnx: <environment>.png by default")
     ] = None,
     allow_pickle: Annotated[bool, typer.Option("--allow-pickle", help=ALLOW_PICKLE)] = False,
 ) -> None:
-    """Print a program as text, LaTeX, Graphviz or standalone Python, or draw it."""
+    """Print a program as text, LaTeX, Graphviz, standalone Python or C, draw it, or write it as an ONNX model."""
     if format_ is None:
         format_ = _OF_SUFFIX.get(output.suffix.lower(), "text") if output is not None else "text"
     if format_ not in FORMATS:
@@ -43,7 +45,7 @@ def show(
             raise ValueError(f"{run_or_name} is not a program; ProgPolicy and PRLPolicy learn programs")
         content = _printed(source.program, format_)
     if output is None and isinstance(content, bytes):
-        output = Path(_file_stem(source.program.metadata.get("env")) + ".png")
+        output = Path(_file_stem(source.program.metadata.get("env")) + f".{format_}")
     if output is None:
         typer.echo(content, nl=False)
     else:
@@ -61,12 +63,15 @@ def _printed(program: Program, format_: str) -> str | bytes:
 
     if format_ == "png":
         return _drawn(program)
+    if format_ == "onnx":
+        return _model(program)
     if format_ == "text":
         return programs.export_text(program)
     export: Any = {
         "latex": programs.export_latex,
         "dot": programs.export_graphviz,
         "python": programs.export_python,
+        "c": programs.export_c,
     }[format_]
     return export(program)
 
@@ -81,4 +86,15 @@ def _drawn(program: Program) -> bytes:
     matplotlib.use("Agg")
     buffer = io.BytesIO()
     plot_program(program).figure.savefig(buffer, format="png", dpi=150, bbox_inches="tight")
+    return buffer.getvalue()
+
+
+def _model(program: Program) -> bytes:
+    from sb3_progpolicy.programs import export_onnx
+
+    buffer = io.BytesIO()
+    try:
+        export_onnx(program, buffer)
+    except ImportError as error:
+        raise ValueError(str(error)) from None
     return buffer.getvalue()

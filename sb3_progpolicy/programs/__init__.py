@@ -2,8 +2,10 @@
 
 from sb3_progpolicy.programs import syntax as _syntax
 from sb3_progpolicy.programs.export import (
+    export_c,
     export_graphviz,
     export_latex,
+    export_onnx,
     export_python,
     export_text,
     plot_program,
@@ -33,8 +35,10 @@ __all__ = [
     "ProgramFormatError",
     "ProgramRunner",
     "check_program",
+    "export_c",
     "export_graphviz",
     "export_latex",
+    "export_onnx",
     "export_python",
     "export_text",
     "join_inputs",

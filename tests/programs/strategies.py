@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -99,6 +100,27 @@ def small_program(rng: np.random.Generator) -> Program:
         n_observations=int(rng.integers(1, 5)),
         hidden_size=int(rng.integers(1, 3)),
     )
+
+
+def sparse(program: Program, seed: int) -> Program:
+    """The program with at most three weights of each sum kept and rounded to whole numbers; some read nothing."""
+    rng = np.random.default_rng(seed)
+
+    def row(weights: Vector) -> Vector:
+        kept = rng.permutation(len(weights)) < rng.integers(0, 4)
+        return tuple(np.where(kept, np.round(weights), 0.0).tolist())
+
+    def controller(node: Controller) -> Controller:
+        constant = rng.random() < 0.5
+        rows = tuple((0.0,) * len(weights) if constant else row(weights) for weights in node.weights)
+        return Controller(rows, tuple(np.round(node.bias).tolist()))
+
+    body: Any = controller(program.controllers[-1])
+    for test, then in reversed(list(zip(program.conditions, program.controllers[:-1], strict=True))):
+        kept = {"readout": row(test.readout)} if test.cell == "affine" else {}
+        test = replace(test, weight_ih=tuple(map(row, test.weight_ih)), **kept)
+        body = IfThenElse(test, controller(then), body)
+    return replace(program, body=body)
 
 
 def hanoi_program(seed: int = 0, cell: Cell = "gru", hidden_size: int = 3, n_conditions: int = 2) -> Program:

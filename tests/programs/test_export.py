@@ -3,17 +3,23 @@ import io
 import re
 import subprocess
 import sys
+import textwrap
 from dataclasses import replace
 
 import matplotlib
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from sb3_progpolicy.programs import (
+    ActionSpec,
     Condition,
     Controller,
+    IfThenElse,
+    Program,
     ProgramRunner,
+    export_c,
     export_graphviz,
     export_latex,
     export_python,
@@ -21,7 +27,7 @@ from sb3_progpolicy.programs import (
     join_inputs,
     plot_program,
 )
-from tests.programs.strategies import CELLS, build_program, hanoi_program, programs, random_actions, seeds
+from tests.programs.strategies import CELLS, build_program, hanoi_program, programs, random_actions, seeds, sparse
 
 matplotlib.use("Agg")
 
@@ -46,9 +52,10 @@ def load_policy(source):
 # Python
 
 
-@given(program=programs, seed=seeds)
-@settings(max_examples=80, deadline=None)
-def test_exported_python_takes_the_same_actions_as_the_runner(program, seed):
+@given(program=programs, seed=seeds, few_terms=st.booleans())
+@settings(max_examples=120, deadline=None)
+def test_exported_python_takes_the_same_actions_as_the_runner(program, seed, few_terms):
+    program = sparse(program, seed) if few_terms else program
     rng = np.random.default_rng(seed)
     policy, runner = load_policy(export_python(program)), ProgramRunner(program)
     given_action, reward, done = None, 0.0, False
@@ -61,6 +68,7 @@ def test_exported_python_takes_the_same_actions_as_the_runner(program, seed):
         expected = runner.act(join_inputs(program, observation, given_action, reward, done))[0]
         action = policy.act(observation, None if given_action is None else given_action[0], reward, done)
         if program.action.kind == "box":
+            assert all(type(number) is float for number in action)
             action = np.float32(action)
         np.testing.assert_array_equal(action, expected)
         given_action = random_actions(rng, program.action, 1)
@@ -128,6 +136,45 @@ def test_exported_source_has_the_branches_and_names_of_the_program():
     assert "# previous move 0->1" in source
 
 
+def program_by_hand(weight=-1.0):
+    """Three moves of a cart: away from the left wall, else by the angle, never right after moving left."""
+    nothing = (0.0,) * 9
+    near = Condition("affine", (), (), (), (), (-2.0, *(0.0,) * 8), 1.0)
+    lean = (0.0, weight, 0.0, 0.0, -5.0, 0.0, 0.0, 0.0, 0.0)
+    body = IfThenElse(
+        near,
+        Controller((nothing,) * 3, (0.0, 0.0, 1.0)),
+        Controller((lean, nothing, (0.0, 3.0, *(0.0,) * 7)), (0.0, 2.0, -1.0)),
+    )
+    moves = ("left", "stay", "right")
+    names = ("position", "angle[0]", "wind", "light", *(f"previous {move}" for move in moves))
+    names = (*names, "previous reward", "previous done")
+    return Program(body, 4, ActionSpec("discrete", (3,)), True, names, moves, metadata={"env": "Cart-v0"})
+
+
+def test_python_of_a_program_with_few_terms_is_what_a_person_would_have_written():
+    source = export_python(program_by_hand())
+    body = source.partition("are accepted")[2].partition("\n")[2]
+    assert textwrap.dedent(body) == (
+        "position = float(observation[0])\n"
+        "angle_0 = float(observation[1])  # angle[0]\n"
+        "action = -1 if previous_action is None else int(previous_action)\n"
+        "if action >= 3 or action < 0 and previous_action is not None:\n"
+        '    raise ValueError("previous_action=%r is not accepted; 0 to 2 is" % (previous_action,))\n'
+        "previous_left = action == 0  # previous left\n"
+        "\n"
+        "if 1 - 2 * position >= 0:\n"
+        "    return 2  # right\n"
+        "else:\n"
+        "    # Controller 2\n"
+        "    left = -angle_0 - 5 * previous_left\n"
+        "    stay = 2\n"
+        "    right = -1 + 3 * angle_0\n"
+        "    scores = (left, stay, right)\n"
+        "    return scores.index(max(scores))\n"
+    )
+
+
 def test_exported_sum_of_thousands_of_terms_still_compiles():
     n = 5000
     program = build_program(0, ["affine", "gru"], "box", False, n_observations=n, hidden_size=1)
@@ -168,6 +215,42 @@ def test_text_of_a_small_program_reads_like_this():
         "    stay = -1.00\n"
     )
     assert str(program) == export_text(program)
+
+
+def test_whole_numbers_are_printed_without_a_point_where_all_are_whole():
+    assert export_text(program_by_hand()).partition("\n\n")[2] == (
+        "if B1 >= 0:\n"
+        "    left  = 0\n"
+        "    stay  = 0\n"
+        "    right = 1\n"
+        "else:\n"
+        "    left  = -5*[previous left] - angle[0]\n"
+        "    stay  = 2\n"
+        "    right = -1 + 3*angle[0]\n"
+        "\n"
+        "B1 = 1 - 2*position\n"
+    )
+    assert "left = 0  -5 previous left  -angle[0]\\l" in export_graphviz(program_by_hand())
+    assert "0 & -1 & 0 & 0 & -5 & 0" in export_latex(program_by_hand())
+    assert "    left  = -5.00*[previous left] - 0.50*angle[0]\n" in export_text(program_by_hand(-0.5))
+    assert "3.00*angle[0]" in export_text(program_by_hand(-0.5))
+
+
+def test_every_print_counts_what_it_leaves_out_or_shows_that_it_is_there():
+    program = program_by_hand(-0.001)
+    assert "left  = -5.00*[previous left] + (1 smaller term)" in export_text(program)
+    assert "left = 0  -5.00 previous left  (1 smaller term)" in export_graphviz(program)
+    assert "0 & 0.00 & 0 & 0 & -5.00" in export_latex(program)
+    axes = plot_program(program)
+    assert "… 1" in [text.get_text() for text in axes.texts]
+    matplotlib.pyplot.close(axes.figure)
+    assert "smaller" not in export_text(program, decimals=3)
+
+
+def test_name_that_is_a_number_is_not_read_as_one():
+    program = replace(program_by_hand(), input_names=("1", "7", *"abcdefg"))
+    assert "B1 = 1 - 2*[1]" in export_text(program)
+    assert " - [7]\n" in export_text(program)
 
 
 def test_text_shows_structure_and_memory():
@@ -266,7 +349,7 @@ def test_latex_gives_every_matrix():
     assert r"\text{move 0-\textgreater{}1}" in source
 
 
-@pytest.mark.parametrize("export", [export_graphviz, export_latex, export_python])
+@pytest.mark.parametrize("export", [export_c, export_graphviz, export_latex, export_python])
 def test_out_file_may_be_a_path_or_an_open_file(export, tmp_path):
     program, buffer, path = hanoi_program(), io.StringIO(), tmp_path / "out"
     assert export(program, buffer) is None
@@ -274,7 +357,7 @@ def test_out_file_may_be_a_path_or_an_open_file(export, tmp_path):
     assert buffer.getvalue() == path.read_text(encoding="utf-8") == export(program)
 
 
-@pytest.mark.parametrize("export", [export_text, export_graphviz, export_latex, export_python, plot_program])
+@pytest.mark.parametrize("export", [export_c, export_text, export_graphviz, export_latex, export_python, plot_program])
 def test_malformed_program_is_refused(export):
     broken = replace(hanoi_program(), output_names=("a\nimport os",) * 6)
     with pytest.raises(ValueError, match="output_names"):

@@ -36,7 +36,7 @@ from sb3_progpolicy.programs.validation import (
 )
 from tests.programs.formats import check_python, plain_tree
 from tests.programs.hostile import PIECES, with_hostile_texts
-from tests.programs.strategies import build_program, hanoi_program, small_program
+from tests.programs.strategies import build_program, hanoi_program, small_program, sparse
 
 matplotlib.use("Agg")
 
@@ -62,6 +62,7 @@ def test_no_text_of_a_program_adds_a_node_to_the_exported_python():
     rng = np.random.default_rng(0)
     for _ in range(200):
         program = small_program(rng)
+        program = sparse(program, 0) if rng.random() < 0.5 else program
         expected = plain_tree(program)
         for _ in range(10):
             check_python(with_hostile_texts(program, rng), expected)
@@ -115,7 +116,7 @@ def test_name_in_a_text_cannot_pass_for_another_term_or_another_output():
     controller, action = Controller(((1.0, 2.0),), (0.0,)), ActionSpec("discrete", (1,))
     names = {"input_names": ("a] - 5.00*[b", "rank [x]"), "output_names": ("left = 9.00",)}
     text = export_text(replace(program, body=controller, action=action, **names))
-    assert text.splitlines()[-1] == "    [left = 9.00] = 2.00*[rank [x]] + 1.00*'a] - 5.00*[b'"
+    assert text.splitlines()[-1] == "    [left = 9.00] = 2*[rank [x]] + 'a] - 5.00*[b'"
 
 
 def test_hostile_latex_compiles_and_runs_nothing(tmp_path):
@@ -201,7 +202,7 @@ import sys, matplotlib
 matplotlib.use("Agg")
 from sb3_progpolicy.programs import *
 program = load_program(sys.argv[1])
-for export in (export_text, export_graphviz, export_latex, export_python, plot_program):
+for export in (export_c, export_text, export_graphviz, export_latex, export_python, plot_program):
     export(program)
 """
 

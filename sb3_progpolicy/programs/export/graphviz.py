@@ -7,6 +7,7 @@ from typing import Any
 
 from sb3_progpolicy.programs.export.visitor import (
     CELL_NAMES,
+    Decimals,
     ProgramVisitor,
     counted,
     deliver,
@@ -25,8 +26,8 @@ def export_graphviz(
 ) -> str | None:
     """Draw a program in the DOT language.
 
-    Conditions are boxes, controllers are leaves with their largest terms. Render the source with ``dot -Tsvg`` or
-    ``graphviz.Source(source)``.
+    Conditions are boxes, controllers are leaves with their largest terms; the others are counted. Render the source
+    with ``dot -Tsvg`` or ``graphviz.Source(source)``.
 
     :param program: what to draw
     :param out_file: a path or an open text file to write to
@@ -50,7 +51,7 @@ def export_graphviz(
 class _DotPrinter(ProgramVisitor[list[str]]):
     def __init__(self, program: ProgramData, decimals: int, max_terms: int | None) -> None:
         super().__init__(program)
-        self.decimals, self.max_terms = decimals, max_terms
+        self.number, self.max_terms = Decimals(program, decimals), max_terms
 
     def visit_branch(self, branch: IfThenElse, index: int) -> list[str]:
         following = f"B{index + 2}" if isinstance(branch.orelse, IfThenElse) else f"C{index + 2}"
@@ -88,12 +89,13 @@ class _DotPrinter(ProgramVisitor[list[str]]):
         ]
 
     def _sum(self, constant: float, weights: tuple[float, ...], names: Any) -> str:
-        terms = largest_terms(weights, names, self.decimals, self.max_terms)
+        terms = largest_terms(weights, names, self.number.digits, self.max_terms)
         tokens = [
-            f"{round(constant, self.decimals) or 0.0:.{self.decimals}f}",
-            *(f"{weight:+.{self.decimals}f} {name}" for weight, name in terms.shown),
+            self.number(constant),
+            *(f"{'-' if weight < 0 else '+'}{self.number.factor(weight, ' ')}{name}" for weight, name in terms.shown),
+            *([f"({counted(terms.n_dropped, 'smaller term')})"] if terms.n_dropped else []),
         ]
-        return "  ".join(tokens) + (" ..." if terms.n_dropped else "")
+        return "  ".join(tokens)
 
 
 def _quote(*lines: str, end: str = "n") -> str:

@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
-from sb3_progpolicy.programs.export.visitor import ProgramVisitor, deliver
+from sb3_progpolicy.programs.export.visitor import Decimals, ProgramVisitor, deliver
 from sb3_progpolicy.programs.syntax import GATES, Condition, Controller, IfThenElse, Matrix, ProgramData
 from sb3_progpolicy.spaces import ActionSpec
 
@@ -46,9 +46,9 @@ def export_latex(
 ) -> str | None:
     r"""Typeset a program: the case distinction, the conditions' recurrences and all matrices, in the paper's notation.
 
-    The result is a fragment for a document that loads ``amsmath``. All weights are given, none is dropped. No name
-    becomes a command. A character beyond ASCII is printed as its code, such as ``\u2192``, unless it is a letter of a
-    Western European language.
+    The result is a fragment for a document that loads ``amsmath``. All weights are given, none is dropped: 0 is
+    zero, and 0.00 a number that rounds to it. No name becomes a command. A character beyond ASCII is printed as its
+    code, such as ``\u2192``, unless it is a letter of a Western European language.
 
     :param program: what to typeset
     :param out_file: a path or an open text file to write to
@@ -62,7 +62,7 @@ def export_latex(
 class _LatexPrinter(ProgramVisitor[list[str]]):
     def __init__(self, program: ProgramData, decimals: int) -> None:
         super().__init__(program)
-        self.decimals = decimals
+        self.number = Decimals(program, decimals)
 
     def print(self) -> str:
         program = self.program
@@ -95,7 +95,7 @@ class _LatexPrinter(ProgramVisitor[list[str]]):
 
     def _condition(self, condition: Condition, index: int) -> list[str]:
         readout = self._matrix((condition.readout,))
-        constant = self._number(condition.readout_bias)
+        constant = self.number(condition.readout_bias)
         if condition.cell == "affine":
             return [rf"B_{{{index}}}(x) &= {constant} + {readout} x"]
         recurrence = [f"{line.replace('%d', str(index))} \\\\" for line in _CELLS[condition.cell]]
@@ -118,11 +118,8 @@ class _LatexPrinter(ProgramVisitor[list[str]]):
 
     def _matrix(self, matrix: Matrix) -> str:
         # array, because pmatrix stops at ten columns
-        rows = " \\\\\n  ".join(" & ".join(self._number(value) for value in row) for row in matrix)
+        rows = " \\\\\n  ".join(" & ".join(self.number(value) for value in row) for row in matrix)
         return rf"\left(\begin{{array}}{{{'r' * len(matrix[0])}}} {rows} \end{{array}}\right)"
-
-    def _number(self, value: float) -> str:
-        return f"{value:.{self.decimals}f}" if round(value, self.decimals) else "0"
 
 
 def _affine(index: int) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 from sb3_progpolicy.programs.export.visitor import (
     CELL_NAMES,
+    Decimals,
     ProgramVisitor,
     counted,
     input_importance,
@@ -108,7 +109,7 @@ def _how_to_read(program: ProgramData) -> tuple[str, ...]:
     order = "Read from top to bottom: the first condition that holds decides. " if program.conditions else ""
     return (
         f"{order}{what}",
-        "Constant first, then the largest terms: green raises the value, red lowers it, … stands for smaller terms.",
+        "Constant first, then the largest terms: green raises the value, red lowers it, … counts the smaller terms.",
     )
 
 
@@ -117,7 +118,7 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
 
     def __init__(self, program: ProgramData, decimals: int, max_terms: int, max_outputs: int) -> None:
         super().__init__(program)
-        self.decimals, self.max_terms, self.max_outputs = decimals, max_terms, max_outputs
+        self.number, self.max_terms, self.max_outputs = Decimals(program, decimals), max_terms, max_outputs
 
     def visit_branch(self, branch: IfThenElse, index: int) -> list[tuple[_Card | None, _Card]]:
         pair = (self._condition(branch.condition, index), self._leaf(branch.then))
@@ -166,17 +167,16 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
     def _terms(
         self, constant: float, weights: Sequence[float], names: Sequence[str]
     ) -> tuple[str, list[tuple[str, str]]]:
-        terms = largest_terms(weights, names, self.decimals, self.max_terms)
+        terms = largest_terms(weights, names, self.number.digits, self.max_terms)
         shown = [
-            (f"{_number(weight, self.decimals, '+')} {_label(name)}", RAISES if weight > 0 else LOWERS)
+            (
+                f"{MINUS if weight < 0 else '+'}{self.number.factor(weight, ' ')}{_label(name)}",
+                RAISES if weight > 0 else LOWERS,
+            )
             for weight, name in terms.shown
         ]
-        return _number(constant, self.decimals), [*shown, *([("…", QUIET)] if terms.n_dropped else [])]
-
-
-def _number(value: float, decimals: int, sign: str = "") -> str:
-    shown = round(value, decimals) or 0.0  # no "-0.0"
-    return f"{shown:{sign}.{decimals}f}".replace("-", MINUS)
+        left_out = [(f"… {terms.n_dropped}", QUIET)] if terms.n_dropped else []
+        return self.number(constant).replace("-", MINUS), [*shown, *left_out]
 
 
 def _label(name: str) -> str:

@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
-import keyword
 import os
-import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sb3_progpolicy.programs.export.visitor import CELL_NAMES, ProgramVisitor, counted, deliver, gate_names, pack, title
+from sb3_progpolicy.programs.export.python_source import (
+    WIDTH,
+    Identifiers,
+    cell_statements,
+    commented,
+    condition_words,
+    float_number,
+    index_statements,
+    list_lines,
+    number,
+    separated,
+    strings_lines,
+    sum_statements,
+    sum_tokens,
+    tuple_of,
+    unpack,
+)
+from sb3_progpolicy.programs.export.visitor import ProgramVisitor, counted, deliver, gate_names, pack, title
 from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, ProgramData
 
-WIDTH = 110
-TERMS_PER_STATEMENT = 50  # Python's parser and compiler limit how long a sum may be
+FEW_TERMS = 6  # a program none of whose sums has more is written as a person would write it
 # Python looks for a file's encoding in its first two lines. With this one first, no text of a program can set it.
 _CODING = "# -*- coding: utf-8 -*-"
-_MAX_IDENTIFIER = 40
-# Names that the written method uses itself, and Python's own.
-_TAKEN = {"self", "observation", "previous_action", "previous_reward", "previous_done", "reward", "done", "action"}
-_TAKEN |= {"scores", "tanh", "float", "int", "len", "max", "min", "map", *keyword.kwlist}
-# The local variables of the written method: one of these letters or words, then numbers.
-_OURS = re.compile(r"((new_)?[bhcrznifgoup]|scores|given|action)(_?[0-9])+")
 
 
 def export_python(program: ProgramData, out_file: str | os.PathLike[str] | Any | None = None) -> str | None:
@@ -29,7 +37,10 @@ def export_python(program: ProgramData, out_file: str | os.PathLike[str] | Any |
 
     Its class ``ProgramPolicy`` has ``reset()`` and ``act(observation, previous_action, previous_reward,
     previous_done)`` and chooses the same actions as :class:`~sb3_progpolicy.programs.interpreter.ProgramRunner` with
-    crisp semantics, to the last bit of every number: sums are taken in the same order.
+    crisp semantics, to the last bit of every number: sums are taken in the same order. Terms with the weight 0 are not
+    written, and whole numbers without a point. A program none of whose sums has more than six terms is written as a
+    person would: it reads only the inputs that it needs, by their names, tests affine conditions where they decide, and
+    returns an action that does not depend on them as it is.
 
     No text of a program becomes code, whoever made it: names and title are written as string literals and comments in
     ASCII, with all other characters escaped. Variables are named with letters, digits and underscores only.
@@ -57,12 +68,16 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
         action = program.action
         self.one_hot = program.interaction and action.kind in ("discrete", "multi_discrete")
         self.parts = len(action.sizes) if self.one_hot else 0
-        self.names = _Identifiers()
+        self.names = Identifiers()
         observed = program.n_observations
         self.inputs = [self.names.new(name) for name in program.input_names[:observed]]
         history = program.input_names[observed:-2] if program.interaction else ()
-        # The one-hot code is never built: its index picks a row of a table instead.
-        self.history = [""] * len(history) if self.one_hot else [self.names.new(name) for name in history]
+        weights = _weights_of_inputs(program)
+        self.used = [any(column) for column in zip(*weights, strict=True)] or [False] * program.n_inputs
+        self.by_hand = max(sum(map(bool, row)) for row in weights) <= FEW_TERMS
+        # Of a larger program the one-hot code is never built: its index picks a row of a table instead.
+        tables = self.one_hot and not self.by_hand
+        self.history = [""] * len(history) if tables else [self.names.new(name) for name in history]
         self.outputs = [self.names.new(name) for name in program.output_names]
         self.tables: list[str] = []
 
@@ -75,10 +90,20 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
     def visit_branch(self, branch: IfThenElse, index: int) -> list[str]:
         word = "elif" if index else "if"
         return [
-            f"{word} b{index + 1} >= 0.0:",
+            *self._test(word, branch.condition, index + 1),
             *(f"    {line}" for line in self._controller(branch.then, index)),
             *self.visit(branch.orelse, index + 1),
         ]
+
+    def _test(self, word: str, condition: Condition, index: int) -> list[str]:
+        if not self.by_hand or condition.cell != "affine":
+            return [f"{word} b{index} >= 0.0:"]
+        terms = zip(condition.readout, self._variables(), strict=True)
+        tokens = sum_tokens(number(condition.readout_bias), [term for term in terms if term[0]])
+        line = f"{word} {' '.join(tokens)} >= 0:"
+        return (
+            [line] if len(line) <= WIDTH - 10 else [f"{word} (", *pack(tokens, "    ", "    ", WIDTH - 12), ") >= 0:"]
+        )
 
     def visit_controller(self, controller: Controller, index: int) -> list[str]:
         lines = self._controller(controller, index)
@@ -88,7 +113,7 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
         n = len(self.program.conditions)
         return [
             _CODING,
-            f"# {_commented(title(self.program))}: {counted(n, 'condition')}, {counted(n + 1, 'controller')}.",
+            f"# {commented(title(self.program))}: {counted(n, 'condition')}, {counted(n + 1, 'controller')}.",
             "# Written by sb3-progpolicy. Needs Python 3.8 or newer and nothing else.",
             "#",
             "#     policy = ProgramPolicy()",
@@ -100,15 +125,16 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
 
     def _class(self) -> list[str]:
         program, states = self.program, self._states()
-        reset = [f"self._{name} = {_tuple('0.0' for _ in locals_)}" for name, locals_ in states]
+        memory = " whose conditions remember what they have read" if states else ""
+        reset = [f"self._{name} = {tuple_of('0.0' for _ in locals_)}" for name, locals_ in states]
         return [
             "",
             "class ProgramPolicy:",
-            '    """An if-then-else over affine controllers whose conditions remember what they have read."""',
+            f'    """An if-then-else over affine controllers{memory}."""',
             "",
             f"    n_observations = {program.n_observations}",
-            *_strings("    input_names", program.input_names),
-            *_strings("    output_names", program.output_names),
+            *strings_lines("    input_names", program.input_names),
+            *strings_lines("    output_names", program.output_names),
             "",
             "    def __init__(self):",
             "        self.reset()",
@@ -146,38 +172,67 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
         return states
 
     def _read_inputs(self) -> list[str]:
-        program, action = self.program, self.program.action
-        n = program.n_observations
+        program, n = self.program, self.program.n_observations
         lines = [
             f"if len(observation) != {n}:",
             f'    raise ValueError("observation holds %d numbers; {n} are accepted" % len(observation))',
         ]
-        if n:
-            lines += _unpack(self.inputs, "map(float, observation)")
-        observed = program.input_names[:n]
-        lines += [f"# {variable}: {_commented(name)}" for variable, name in zip(self.inputs, observed, strict=True)]
+        if self.by_hand:
+            lines += [
+                _named(self.inputs[k], f"float(observation[{k}])", program.input_names[k])
+                for k in range(n)
+                if self.used[k]
+            ]
+        elif n:
+            lines += unpack(self.inputs, "map(float, observation)")
+            named = zip(self.inputs, program.input_names[:n], strict=True)
+            lines += [f"# {variable}: {commented(name)}" for variable, name in named if variable != name]
         if not program.interaction:
             return lines
-        if self.one_hot:
+        lines += self._read_history() if not self.by_hand or any(self.used[n:-2]) else []
+        lines += ["reward = float(previous_reward)"] * self.used[-2]
+        return [*lines, *["done = float(previous_done)"] * self.used[-1]]
+
+    def _read_history(self) -> list[str]:
+        """Statements for the previous action, as an index into tables or by the names of what X holds of it."""
+        action, n, lines = self.program.action, self.program.n_observations, list[str]()
+        if self.one_hot and not self.by_hand:
             lines.append(
                 "# Actions pick rows of the tables at the end of the file; -1, the last row, is for no action."
             )
         if action.kind == "discrete":
-            lines += _index("action", "previous_action", action.start, action.sizes[0])
+            lines += index_statements("action", "previous_action", action.start, action.sizes[0])
         elif action.kind == "multi_discrete":
             source = f"[None] * {self.parts} if previous_action is None else previous_action"
-            lines += _unpack([f"given_{part}" for part in range(self.parts)], source)
+            lines += unpack([f"given_{part}" for part in range(self.parts)], source)
             for part, size in enumerate(action.sizes):
-                lines += _index(f"action_{part}", f"given_{part}", 0, size)
-        else:
+                lines += index_statements(f"action_{part}", f"given_{part}", 0, size)
+        elif not self.by_hand:
             zeros = f"[0.0] * {len(self.history)} if previous_action is None else previous_action"
-            lines += _unpack(self.history, f"map(float, {zeros})")
-        return [*lines, "reward = float(previous_reward)", "done = float(previous_done)"]
+            return [*lines, *unpack(self.history, f"map(float, {zeros})")]
+        if not self.by_hand:
+            return lines
+        sources = [
+            f"0.0 if previous_action is None else float(previous_action[{k}])" for k in range(action.history_size)
+        ]
+        if self.one_hot:
+            single = action.kind == "discrete"
+            parts = enumerate(action.sizes)
+            sources = [f"action{'' if single else f'_{part}'} == {k}" for part, size in parts for k in range(size)]
+        names = self.program.input_names[n:-2]
+        chosen = zip(self.history, sources, names, self.used[n:-2], strict=True)
+        return [*lines, *(_named(variable, source, name) for variable, source, name, used in chosen if used)]
+
+    def _variables(self) -> list[str]:
+        """The variable of every number of X, of a program that is written as by hand."""
+        return [*self.inputs, *self.history, *["reward", "done"] * self.program.interaction]
 
     def _advance_conditions(self) -> list[str]:
-        lines = [f"{_tuple(names)} = self._{name}" for name, names in self._states()]
+        lines = [f"{tuple_of(names)} = self._{name}" for name, names in self._states()]
         for index, condition in enumerate(self.program.conditions, start=1):
-            lines += ["", f"# Condition {index}: {_condition_words(condition)}", *self._condition(condition, index)]
+            if self.by_hand and condition.cell == "affine":
+                continue
+            lines += ["", f"# Condition {index}: {condition_words(condition)}", *self._condition(condition, index)]
         return [*lines, ""]
 
     def _condition(self, condition: Condition, index: int) -> list[str]:
@@ -193,47 +248,79 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
             if gate == "n":
                 # The reset gate scales this sum before it joins the rest.
                 rows.append(_Row(name, condition.bias_ih[row], condition.weight_ih[row]))
-                recurrent += [*_sum(f"u{name[1:]}", condition.bias_hh[row], terms)]
+                recurrent += [*sum_statements(f"u{name[1:]}", condition.bias_hh[row], terms)]
             else:
                 rows.append(_Row(name, condition.bias_ih[row] + condition.bias_hh[row], condition.weight_ih[row]))
-                recurrent += _sum(name, None, terms)
+                recurrent += sum_statements(name, None, terms)
         lines = [*self._affine(rows, f"CONDITION_{index}"), *recurrent]
         for unit in range(size):
-            lines += _cell(condition.cell, f"{index}_{unit + 1}")
+            lines += cell_statements(condition.cell, f"{index}_{unit + 1}")
         if condition.cell == "rnn":
             lines += [f"{name} = tanh(new_{name})" for name in hidden]
         if condition.cell == "lstm":
-            lines.append(f"self._c{index} = {_tuple(name.replace('h', 'c') for name in hidden)}")
+            lines.append(f"self._c{index} = {tuple_of(name.replace('h', 'c') for name in hidden)}")
         readout = list(zip(condition.readout, hidden, strict=True))
-        return [*lines, f"self._h{index} = {_tuple(hidden)}", *_sum(f"b{index}", condition.readout_bias, readout)]
+        return [
+            *lines,
+            f"self._h{index} = {tuple_of(hidden)}",
+            *sum_statements(f"b{index}", condition.readout_bias, readout),
+        ]
 
     def _controller(self, controller: Controller, index: int) -> list[str]:
         action, names = self.program.action, self.outputs
+        if self.by_hand and not any(map(any, controller.weights)):
+            return self._constant_action(controller.bias)
         rows = [_Row(*row) for row in zip(names, controller.bias, controller.weights, strict=True)]
         lines = [f"# Controller {index + 1}", *self._affine(rows, f"CONTROLLER_{index + 1}")]
         if action.kind == "discrete":
             start = f" + {action.start}" if action.start else ""
-            return [*lines, f"scores = {_tuple(names)}", f"return scores.index(max(scores)){start}"]
+            return [*lines, f"scores = {tuple_of(names)}", f"return scores.index(max(scores)){start}"]
         if action.kind == "multi_binary":
-            return [*lines, *_list("return", (f"1 if {name} > 0.0 else 0" for name in names))]
+            return [*lines, *list_lines("return", (f"1 if {name} > 0.0 else 0" for name in names))]
         if action.kind == "box":
             bounds = zip(names, action.low, action.high, strict=True)
             return [
                 *lines,
-                *_list("return", (f"min(max({n}, {_float(low)}), {_float(high)})" for n, low, high in bounds)),
+                *list_lines(
+                    "return", (f"min(max({n}, {float_number(low)}), {float_number(high)})" for n, low, high in bounds)
+                ),
             ]
         first = 0
         for part, size in enumerate(action.sizes):
-            lines.append(f"scores_{part} = {_tuple(names[first : first + size])}")
+            lines.append(f"scores_{part} = {tuple_of(names[first : first + size])}")
             first += size
         return [
             *lines,
-            *_list("return", (f"scores_{p}.index(max(scores_{p}))" for p in range(self.parts or len(action.sizes)))),
+            *list_lines(
+                "return", (f"scores_{p}.index(max(scores_{p}))" for p in range(self.parts or len(action.sizes)))
+            ),
         ]
+
+    def _constant_action(self, scores: Sequence[float]) -> list[str]:
+        """The statement that returns the action of a controller that reads nothing."""
+        action = self.program.action
+        if action.kind == "box":
+            clipped = [min(max(s, low), high) for s, low, high in zip(scores, action.low, action.high, strict=True)]
+            items = [float_number(value) for value in clipped]
+        elif action.kind == "multi_binary":
+            items = [str(int(score > 0)) for score in scores]
+        else:
+            best, first = [], 0
+            for size in action.sizes:
+                part = scores[first : first + size]
+                best.append(part.index(max(part)))
+                first += size
+            if action.kind == "discrete":
+                return [f"return {best[0] + action.start}  # {commented(self.program.output_names[best[0]])}"]
+            items = [str(choice) for choice in best]
+        line = f"return [{', '.join(items)}]"
+        return [line] if len(line) <= WIDTH - 15 else list_lines("return", items)
 
     def _affine(self, rows: Sequence[_Row], table: str) -> list[str]:
         """Statements that compute all rows, with the terms in the order of X. A one-hot action's come from a table."""
-        n, lines, picked = self.program.n_observations, [], []
+        n, lines, picked = self.program.n_observations, list[str](), []
+        if self.by_hand:
+            return [line for row in rows for line in self._sum(row, zip(row.weights, self._variables(), strict=True))]
         first = n
         for part in range(self.parts):
             size = self.program.action.sizes[part]
@@ -244,135 +331,42 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
                 names = [f"p{suffix}_{number}" for number in range(len(rows))]
                 self._table(f"{table}_AFTER_ACTION{suffix}", columns, first - size)
                 index = f"action{suffix}"
-                lines += _unpack(names, f"{table}_AFTER_ACTION{suffix}[{index}]")
+                lines += unpack(names, f"{table}_AFTER_ACTION{suffix}[{index}]")
                 picked.append(names)
-        for number, row in enumerate(rows):
+        for place, row in enumerate(rows):
             terms = list(zip(row.weights[:n], self.inputs, strict=True))
             if self.one_hot:
-                terms += [(1.0, names[number]) for names in picked]
+                terms += [(1.0, names[place]) for names in picked]
             elif self.program.interaction:
                 terms += list(zip(row.weights[n:-2], self.history, strict=True))
             if self.program.interaction:
                 terms += [(row.weights[-2], "reward"), (row.weights[-1], "done")]
-            lines += _sum(row.name, row.constant, terms)
+            lines += self._sum(row, terms)
         return lines
+
+    def _sum(self, row: _Row, terms: Iterable[tuple[float, str]]) -> list[str]:
+        if self.program.action.kind == "box" and not any(row.weights):
+            # A whole number among the actions would make an array of them one of whole numbers.
+            return [f"{row.name} = {float_number(row.constant)}"]
+        return sum_statements(row.name, row.constant, list(terms))
 
     def _table(self, name: str, columns: Sequence[Sequence[float]], first: int) -> None:
         """A constant: what each previous action adds to every row. The last line, at index -1, is for no action."""
         self.tables += ["", f"{name} = ("]
         for choice, column in enumerate(columns):
-            comment = f"# {_commented(self.program.input_names[first + choice])}"
-            self.tables += [f"    {comment}", *pack(_separated(map(_float, column)), "    (", "     ", WIDTH)]
+            comment = f"# {commented(self.program.input_names[first + choice])}"
+            self.tables += [f"    {comment}", *pack(separated(map(number, column)), "    (", "     ", WIDTH)]
             self.tables[-1] += "),"
         self.tables += ["    # no action yet", f"    (0.0,) * {len(columns[0])},", ")"]
 
 
-class _Identifiers:
-    """Readable and unique variable names of ASCII letters, digits and underscores, made from any text."""
-
-    def __init__(self) -> None:
-        self.used: set[str] = set()
-        self.versions: dict[str, int] = {}  # the last version of each name that is used more than once
-
-    def new(self, text: str) -> str:
-        name = re.sub(r"[^0-9a-zA-Z]+", "_", text).strip("_").lower()[:_MAX_IDENTIFIER]
-        if not name or name[0].isdigit() or name in _TAKEN or _OURS.fullmatch(name):
-            name = f"x_{name}".rstrip("_")
-        unique = name
-        while unique in self.used:
-            self.versions[name] = self.versions.get(name, 1) + 1
-            unique = f"{name}_v{self.versions[name]}"
-        self.used.add(unique)
-        return unique
+def _weights_of_inputs(program: ProgramData) -> list[Sequence[float]]:
+    """The weights of X in every sum of a program."""
+    rows: list[Sequence[float]] = [row for controller in program.controllers for row in controller.weights]
+    for condition in program.conditions:
+        rows += [condition.readout] if condition.cell == "affine" else condition.weight_ih
+    return rows
 
 
-def _sum(name: str, constant: float | None, terms: Sequence[tuple[float, str]]) -> list[str]:
-    """Statements for ``name = constant + terms``, or ``name + terms`` where the constant is ``None``."""
-    kept = [(weight, variable) for weight, variable in terms if weight]
-    start, lines = name if constant is None else _float(constant), []
-    for first in range(0, max(len(kept), constant is not None), TERMS_PER_STATEMENT):
-        tokens = [start, *map(_token, kept[first : first + TERMS_PER_STATEMENT])]
-        if len(tokens) > 1 and start in ("0.0", "-0.0"):
-            tokens = [tokens[1].replace("- ", "-", 1) if tokens[1][0] == "-" else tokens[1][2:], *tokens[2:]]
-        if len(name) + sum(len(token) + 1 for token in tokens) <= WIDTH - 15:
-            lines.append(f"{name} = {' '.join(tokens)}")
-        else:
-            lines += [f"{name} = (", *pack(tokens, "    ", "    ", WIDTH - 12), ")"]
-        start = name
-    return lines
-
-
-def _token(term: tuple[float, str]) -> str:
-    weight, variable = term
-    sign = "-" if weight < 0 else "+"
-    return f"{sign} {variable}" if abs(weight) == 1 else f"{sign} {_float(abs(weight))} * {variable}"
-
-
-def _cell(cell: str, unit: str) -> Iterator[str]:
-    """Update one unit of a GRU or an LSTM from its sums, by PyTorch's equations; an RNN's are updated together."""
-    if cell == "gru":
-        yield f"r{unit} = 0.5 + 0.5 * tanh(0.5 * r{unit})"
-        yield f"z{unit} = 0.5 + 0.5 * tanh(0.5 * z{unit})"
-        yield f"n{unit} = tanh(n{unit} + r{unit} * u{unit})"
-        yield f"h{unit} = n{unit} + z{unit} * (h{unit} - n{unit})"
-    elif cell == "lstm":
-        yield f"i{unit} = 0.5 + 0.5 * tanh(0.5 * i{unit})"
-        yield f"f{unit} = 0.5 + 0.5 * tanh(0.5 * f{unit})"
-        yield f"o{unit} = 0.5 + 0.5 * tanh(0.5 * o{unit})"
-        yield f"c{unit} = f{unit} * c{unit} + i{unit} * tanh(g{unit})"
-        yield f"h{unit} = o{unit} * tanh(c{unit})"
-
-
-def _condition_words(condition: Condition) -> str:
-    if condition.cell == "affine":
-        return "affine, no memory"
-    words = {"rnn": "h = tanh(...)", "gru": "reset r, update z, candidate n, memory h"}
-    how = words.get(condition.cell, "input i, forget f, candidate g, output o, memory c and h")
-    return f"{counted(condition.hidden_size, CELL_NAMES[condition.cell] + ' unit')}: {how}"
-
-
-def _index(name: str, given: str, start: int, size: int) -> list[str]:
-    """Statements that turn an action into an index, -1 for none."""
-    shift = f" - {start}" if start else ""
-    return [
-        f"{name} = -1 if {given} is None else int({given}){shift}",
-        f"if {name} >= {size} or {name} < 0 and {given} is not None:",
-        f'    raise ValueError("previous_action=%r is not accepted; {start} to {start + size - 1} is" % ({given},))',
-    ]
-
-
-def _unpack(names: Sequence[str], source: str) -> list[str]:
-    lines = pack(_separated(names), "(", " ", WIDTH - 30)
-    lines[-1] += f") = {source}"
-    return lines
-
-
-def _separated(items: Iterable[str]) -> list[str]:
-    """The items of a tuple, with commas as Python wants them."""
-    *first, last = items
-    return [*(f"{item}," for item in first), last if first else f"{last},"]
-
-
-def _tuple(items: Iterable[str]) -> str:
-    return f"({' '.join(_separated(items))})"
-
-
-def _list(start: str, items: Iterable[str]) -> list[str]:
-    return [f"{start} [", *(f"    {item}," for item in items), "]"]
-
-
-def _strings(name: str, values: Sequence[str]) -> list[str]:
-    return [f"{name} = (", *pack([f"{_literal(value)}," for value in values], "        ", "        ", WIDTH), "    )"]
-
-
-def _literal(text: str) -> str:
-    return ascii(str(text))  # str, because NumPy's strings are written with their type
-
-
-def _commented(text: str) -> str:
-    return _literal(text)[1:-1]
-
-
-def _float(value: float) -> str:
-    # The sum of two constants may be infinite, and "inf" would be a variable.
-    return repr(float(value)).replace("inf", "1e999")
+def _named(variable: str, source: str, name: str) -> str:
+    return f"{variable} = {source}" + ("" if variable == name else f"  # {commented(name)}")

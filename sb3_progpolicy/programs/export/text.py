@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from sb3_progpolicy.programs.export.visitor import (
     CELL_NAMES,
+    Decimals,
     ProgramVisitor,
     action_rule,
     counted,
@@ -30,7 +31,8 @@ def export_text(program: ProgramData, decimals: int = 2, max_terms: int | None =
     """Print a program as an indented if-then-else that a person can read.
 
     The terms of every sum stand in order of size. Those that round to zero or come after ``max_terms`` are only
-    counted. :func:`export_python` and the saved file hold all numbers in full.
+    counted. If all weights and constants are whole, they are printed without a point. :func:`export_python` and the
+    saved file hold all numbers in full.
 
     :param program: what to print
     :param decimals: digits after the point
@@ -44,8 +46,8 @@ def export_text(program: ProgramData, decimals: int = 2, max_terms: int | None =
 class _TextPrinter(ProgramVisitor[list[str]]):
     def __init__(self, program: ProgramData, decimals: int, max_terms: int | None) -> None:
         super().__init__(program)
-        self.decimals, self.max_terms = decimals, max_terms
-        self.inputs = [_set_apart(name) if _OPERATORS & set(name) else name for name in program.input_names]
+        self.number, self.max_terms = Decimals(program, decimals), max_terms
+        self.inputs = [_set_apart(n) if _OPERATORS & set(n) or n[0].isdigit() else n for n in program.input_names]
 
     def print(self) -> str:
         lines = [*self._heading(), "", *self.visit(self.program.body)]
@@ -132,11 +134,11 @@ class _TextPrinter(ProgramVisitor[list[str]]):
         return pack(tokens, start, " " * min(len(start), WIDTH // 2), WIDTH)
 
     def _tokens(self, constant: float, weights: Sequence[float], names: Sequence[str]) -> list[str]:
-        terms = largest_terms(weights, names, self.decimals, self.max_terms)
-        tokens = [f"{constant:.{self.decimals}f}"] if round(constant, self.decimals) else []
+        terms = largest_terms(weights, names, self.number.digits, self.max_terms)
+        tokens = [self.number(constant)] if constant else []
         for weight, name in terms.shown:
             sign = "-" if weight < 0 else "+" if tokens else ""
-            tokens.append(f"{sign}{' ' if tokens else ''}{abs(weight):.{self.decimals}f}*{name}")
+            tokens.append(f"{sign}{' ' if tokens else ''}{self.number.factor(weight, '*')}{name}")
         if terms.n_dropped:
             tokens.append(f"{'+ ' if tokens else ''}({counted(terms.n_dropped, 'smaller term')})")
         return tokens or ["0"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
@@ -65,6 +66,46 @@ def largest_terms(weights: Sequence[float], names: Sequence[str], decimals: int,
     terms = sorted(((weight, name) for weight, name in zip(weights, names, strict=True) if weight), key=_by_size)
     shown = [term for term in terms if round(term[0], decimals)][:max_terms]
     return Terms(tuple(shown), len(terms) - len(shown))
+
+
+def is_whole(value: float) -> bool:
+    """Whether a number is printed without a point: a whole one of up to nine digits."""
+    return math.isfinite(value) and abs(value) < 1e9 and value == int(value)
+
+
+def has_whole_numbers(program: ProgramData) -> bool:
+    """Whether all weights and constants of a program are whole, as those of one written by hand often are."""
+    return all(
+        is_whole(value)
+        for rows in (
+            *((*condition.weight_ih, *condition.weight_hh) for condition in program.conditions),
+            *((condition.bias_ih, condition.bias_hh, condition.readout) for condition in program.conditions),
+            *((*controller.weights, controller.bias) for controller in program.controllers),
+            [[condition.readout_bias for condition in program.conditions]],
+        )
+        for row in rows
+        for value in row
+    )
+
+
+class Decimals:
+    """Numbers as people read them: rounded, or without a point where all of the program's are whole.
+
+    :param program: whose numbers are printed
+    :param decimals: digits after the point
+    """
+
+    def __init__(self, program: ProgramData, decimals: int) -> None:
+        self.digits = 0 if has_whole_numbers(program) else decimals
+
+    def __call__(self, value: float) -> str:
+        """Print a number; one that is not zero but rounds to it is 0.00, and zero itself is 0."""
+        shown = round(value, self.digits) or 0.0  # no "-0.00"
+        return f"{shown:.{self.digits}f}" if value else "0"
+
+    def factor(self, weight: float, between: str) -> str:
+        """Print the size of a weight before a name, nothing for the whole number 1."""
+        return "" if self.digits == 0 and abs(weight) == 1 else f"{self(abs(weight))}{between}"
 
 
 def _by_size(term: tuple[float, str]) -> float:
