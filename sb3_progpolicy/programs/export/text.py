@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from sb3_progpolicy.programs.export.grids import LEGEND, as_function, blocks_of, function_text
 from sb3_progpolicy.programs.export.visitor import (
     CELL_NAMES,
     Decimals,
@@ -17,7 +18,7 @@ from sb3_progpolicy.programs.export.visitor import (
 )
 from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, ProgramData
 
-WIDTH = 110
+WIDTH = 100
 INDENT = "    "
 _OPERATORS = frozenset(" +-*/=<>()")
 _RULES = {
@@ -47,12 +48,14 @@ class _TextPrinter(ProgramVisitor[list[str]]):
     def __init__(self, program: ProgramData, decimals: int, max_terms: int | None) -> None:
         super().__init__(program)
         self.number, self.max_terms = Decimals(program, decimals), max_terms
+        self.blocks = blocks_of(program)
         self.inputs = [_set_apart(n) if _OPERATORS & set(n) or n[0].isdigit() else n for n in program.input_names]
 
     def print(self) -> str:
         lines = [*self._heading(), "", *self.visit(self.program.body)]
         for index, condition in enumerate(self.program.conditions):
             lines += ["", *self._condition(condition, index)]
+        lines += self._legend("\n".join(lines))
         cells = sorted({condition.cell for condition in self.program.conditions} & set(_RULES))
         if cells:
             lines += [
@@ -85,20 +88,34 @@ class _TextPrinter(ProgramVisitor[list[str]]):
             ),
         ]
 
+    def _legend(self, printed: str) -> list[str]:
+        used = [block.name for block in self.blocks if f"{block.name}*(" in printed]
+        return ["", *(LEGEND.format(name=name) for name in used)] if used else []
+
     def _lines(self, controller: Controller) -> list[str]:
         names = [_set_apart(name) if "=" in name else name for name in self.program.output_names]
         width = max(len(name) for name in names)
         lines = []
         for name, constant, weights in zip(names, controller.bias, controller.weights, strict=True):
             start = f"{INDENT}{name.ljust(width)} = "
-            lines += self._sum(start, constant, weights, self.inputs)
+            lines += self._inputs_sum(start, constant, weights)
         return lines
+
+    def _inputs_sum(self, start: str, constant: float, weights: Sequence[float]) -> list[str]:
+        """A sum over X, its grids as functions of row and column where they are such."""
+        left, functions = list(weights), []
+        for block in self.blocks:
+            function = as_function(block, weights)
+            if function is not None and any(function):
+                functions.append(function_text(block, function))
+                left[block.start : block.stop] = [0.0] * (block.stop - block.start)
+        return self._sum(start, constant, left, self.inputs, functions=functions)
 
     def _condition(self, condition: Condition, index: int) -> list[str]:
         size = condition.hidden_size
         start = f"B{index + 1} = "
         if condition.cell == "affine":
-            return self._sum(start, condition.readout_bias, condition.readout, self.inputs)
+            return self._inputs_sum(start, condition.readout_bias, condition.readout)
         units = [f"h{unit + 1}" for unit in range(size)]
         lines = self._sum(start, condition.readout_bias, condition.readout, units)
         lines.append(f"{INDENT}its memory: {counted(size, f'{CELL_NAMES[condition.cell]} unit')}")
@@ -127,9 +144,19 @@ class _TextPrinter(ProgramVisitor[list[str]]):
         return gates
 
     def _sum(
-        self, start: str, constant: float, weights: Sequence[float], names: Sequence[str], close: str = ""
+        self,
+        start: str,
+        constant: float,
+        weights: Sequence[float],
+        names: Sequence[str],
+        close: str = "",
+        functions: Sequence[str] = (),
     ) -> list[str]:
         tokens = self._tokens(constant, weights, names)
+        if functions:
+            first = f"- {tokens[0][1:]}" if tokens[0][0] == "-" else f"+ {tokens[0]}"
+            rest = [] if tokens == ["0"] else [first, *tokens[1:]]
+            tokens = [functions[0], *(f"+ {function}" for function in functions[1:]), *rest]
         tokens[-1] += close
         return pack(tokens, start, " " * min(len(start), WIDTH // 2), WIDTH)
 

@@ -1,0 +1,85 @@
+"""Blocks of inputs that lie on a grid, printed as the function of row and column that their weights are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sb3_progpolicy.programs.syntax import ProgramData
+
+#: Said where a function of row and column is printed.
+LEGEND = "{name}*(...) is summed over all cells {name}[row,column]; rows and columns count from 0."
+
+
+@dataclass(frozen=True)
+class Block:
+    """A grid among the inputs.
+
+    :param name: such as ``table``
+    :param start: index of its first number; rows follow each other
+    :param rows: how many
+    :param columns: how many
+    """
+
+    name: str
+    start: int
+    rows: int
+    columns: int
+
+    @property
+    def stop(self) -> int:
+        """Index after its last number."""
+        return self.start + self.rows * self.columns
+
+
+def blocks_of(program: ProgramData) -> list[Block]:
+    """Return the grids that a program's metadata names, as far as they fit its inputs.
+
+    :param program: whose ``metadata["grids"]``, if it is there, is a list of ``name``, ``start``, ``rows``, ``columns``
+    """
+    named: Any = program.metadata.get("grids")
+    found: list[Block] = []
+    for entry in named if isinstance(named, (list, tuple)) else ():
+        if not isinstance(entry, dict) or set(entry) != {"name", "start", "rows", "columns"}:
+            continue
+        name, sizes = entry["name"], [entry[key] for key in ("start", "rows", "columns")]
+        if not isinstance(name, str) or not name.isidentifier() or any(type(size) is not int for size in sizes):
+            continue
+        block = Block(name, *sizes)
+        after = found[-1].stop if found else 0
+        if block.rows > 0 and block.columns > 0 and after <= block.start <= block.stop <= program.n_observations:
+            found.append(block)
+    return found
+
+
+def as_function(block: Block, weights: Sequence[float]) -> tuple[float, float, float] | None:
+    """Return ``(a, b, c)`` if the weights of a grid are ``a + b*row + c*column``, in whole numbers; else ``None``.
+
+    :param block: the grid
+    :param weights: of all inputs
+    """
+    given = np.array(weights[block.start : block.stop]).reshape(block.rows, block.columns)
+    a = float(given[0, 0])
+    b = float(given[1, 0] - a) if block.rows > 1 else 0.0
+    c = float(given[0, 1] - a) if block.columns > 1 else 0.0
+    rows, columns = np.indices(given.shape)
+    whole = all(number == round(number) for number in (a, b, c))
+    return (a, b, c) if whole and np.array_equal(a + b * rows + c * columns, given) else None
+
+
+def function_text(block: Block, function: tuple[float, float, float]) -> str:
+    """Return a function of row and column in words, such as ``table*(4 - 2*row)``.
+
+    :param block: the grid
+    :param function: from :func:`as_function`; not all zero
+    """
+    parts: list[str] = []
+    for number, name in zip(function, ("", "row", "column"), strict=True):
+        if number:
+            size = abs(int(number))
+            words = f"{size}*{name}" if name and size != 1 else name or str(size)
+            parts.append((" - " if number < 0 else " + ") + words if parts else ("-" if number < 0 else "") + words)
+    return f"{block.name}*({''.join(parts)})"
