@@ -130,7 +130,14 @@ def test_run_model_and_program_are_the_same_source(trained, capsys):
 
 
 @pytest.mark.parametrize(
-    ("format_", "start"), [("text", "Program"), ("latex", "cases"), ("dot", "digraph"), ("python", '"""')]
+    ("format_", "start"),
+    [
+        ("text", "Program"),
+        ("latex", "cases"),
+        ("dot", "digraph"),
+        ("python", '"""'),
+        ("javascript", "class ProgramPolicy"),
+    ],
 )
 def test_show_prints_every_format(format_, start, program, tmp_path, capsys):
     assert run(["show", program, "--format", format_]) == 0

@@ -16,8 +16,8 @@ from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.programs.files import write_atomically
 from sb3_progpolicy.programs.program import Program
 
-FORMATS = ("text", "latex", "dot", "python", "png")
-_OF_SUFFIX = {".txt": "text", ".tex": "latex", ".dot": "dot", ".py": "python", ".png": "png"}
+FORMATS = ("text", "latex", "dot", "python", "javascript", "png")
+_OF_SUFFIX = {".txt": "text", ".tex": "latex", ".dot": "dot", ".py": "python", ".js": "javascript", ".png": "png"}
 
 
 def show(
@@ -30,7 +30,7 @@ def show(
     ] = None,
     allow_pickle: Annotated[bool, typer.Option("--allow-pickle", help=ALLOW_PICKLE)] = False,
 ) -> None:
-    """Print a program as text, LaTeX, Graphviz or standalone Python, or draw it."""
+    """Print a program as text, LaTeX, Graphviz, standalone Python or JavaScript, or draw it."""
     if format_ is None:
         format_ = _OF_SUFFIX.get(output.suffix.lower(), "text") if output is not None else "text"
     if format_ not in FORMATS:
@@ -67,6 +67,7 @@ def _printed(program: Program, format_: str) -> str | bytes:
         "latex": programs.export_latex,
         "dot": programs.export_graphviz,
         "python": programs.export_python,
+        "javascript": programs.export_javascript,
     }[format_]
     return export(program)
 

@@ -1,8 +1,10 @@
 """Programs: the syntax as plain data, and everything that reads, runs, prints and saves it."""
 
 from sb3_progpolicy.programs import syntax as _syntax
+from sb3_progpolicy.programs.explain import ExplainedOutput, Explanation, explain
 from sb3_progpolicy.programs.export import (
     export_graphviz,
+    export_javascript,
     export_latex,
     export_python,
     export_text,
@@ -27,13 +29,17 @@ __all__ = [
     "ActionSpec",
     "Condition",
     "Controller",
+    "ExplainedOutput",
+    "Explanation",
     "Expression",
     "IfThenElse",
     "Program",
     "ProgramFormatError",
     "ProgramRunner",
     "check_program",
+    "explain",
     "export_graphviz",
+    "export_javascript",
     "export_latex",
     "export_python",
     "export_text",

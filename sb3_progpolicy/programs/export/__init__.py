@@ -1,9 +1,10 @@
 """Programs as text, pictures, formulas and source code; one module for each format."""
 
 from sb3_progpolicy.programs.export.graphviz import export_graphviz
+from sb3_progpolicy.programs.export.javascript import export_javascript
 from sb3_progpolicy.programs.export.latex import export_latex
 from sb3_progpolicy.programs.export.plot import plot_program
 from sb3_progpolicy.programs.export.python import export_python
 from sb3_progpolicy.programs.export.text import export_text
 
-__all__ = ["export_graphviz", "export_latex", "export_python", "export_text", "plot_program"]
+__all__ = ["export_graphviz", "export_javascript", "export_latex", "export_python", "export_text", "plot_program"]
