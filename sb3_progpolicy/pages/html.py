@@ -145,7 +145,20 @@ def _facts(program: ProgramData) -> list[str]:
 def _section(docstring: str, name: str) -> str:
     """The text under one heading of a docstring, up to the next heading."""
     found = re.search(rf"^## {name}\n(.*?)(?=^##|\Z)", docstring, re.MULTILINE | re.DOTALL)
-    return found[1].strip() if found else ""
+    return _with_whole_rows(found[1].strip()) if found else ""
+
+
+def _with_whole_rows(text: str) -> str:
+    """A row of a table without a first cell goes on with the row above; Markdown wants both in one line."""
+    lines: list[str] = []
+    for line in text.splitlines():
+        cells = line.split("|")
+        if lines and len(cells) > 2 and not line.partition("|")[0].strip() and not cells[1].strip():
+            above = lines.pop().split("|")
+            cells = [f"{first.rstrip()} {more.strip()}".rstrip() for first, more in zip(above, cells, strict=True)]
+            line = "|".join(cells)
+        lines.append(line)
+    return "\n".join(lines)
 
 
 def _markup(text: str) -> Any:

@@ -6,15 +6,16 @@ class Page {
     this.policy = new ProgramPolicy();
     this.program = this.policy.program;
     this.place = Object.fromEntries(
-      ["tree", "variation", "board", "transport", "hint", "announcer", "reasons", "charts", "inputs", "more-inputs"].map((id) => [id, document.getElementById(id)])
+      ["tree", "variation", "board", "transport", "hint", "announcer", "reasons", "timeline", "charts", "inputs", "more-inputs"].map((id) => [id, document.getElementById(id)])
     );
     this.selected = null;
     this.allInputs = false;
     this.tree = new ProgramView(this.place.tree, this.program, data.importance);
     this.reasons = new ReasonsView(this.place.reasons, this.policy);
-    this.charts = new ChartsView(this.place.charts, this.program, (t) => this.seek(t));
+    this.charts = new ChartsView(this.place.timeline, this.place.charts, this.program, (t) => this.seek(t));
     this.makeTransport();
     if (data.episodes.length) this.makeVariations();
+    else this.makeQuestion();
     const wish = new URLSearchParams(location.hash.slice(1));
     if (data.episodes.length) this.open(Math.min(Number(wish.get("episode") ?? this.firstEpisode()), data.episodes.length - 1));
     else this.ask([new Array(this.program.nObservations).fill(0)], 0);
@@ -118,7 +119,7 @@ class Page {
     const first = button("First step", "first", () => this.step(-this.t));
     const back = button("Step back", "back", () => this.step(-1));
     this.player = button("Play", "play", () => this.play());
-    this.player.classList.add("play");
+    this.player.classList.add("player");
     const forward = button("Step forward", "forward", () => this.step(1));
     this.scrubber = make("input", { type: "range", min: 0, value: 0, "aria-label": "Step", oninput: () => (this.stop(), this.seek(Number(this.scrubber.value))) });
     this.status = make("p", { class: "status" });
@@ -135,6 +136,12 @@ class Page {
       this.place.hint.textContent = BOARDS[this.data.world].hint;
       this.place.hint.hidden = false;
     }
+  }
+
+  makeQuestion() {
+    this.player.hidden = true;
+    this.place.hint.textContent = "Set the inputs: the program answers at once. A step forward keeps the answer and asks again; the program remembers what it has read.";
+    this.place.hint.hidden = false;
   }
 
   showVariation() {
@@ -171,7 +178,7 @@ class Page {
     const reward = frame.final || !this.data.episodes.length ? "" : `, reward ${signed(frame.reward)}`;
     const illegal = frame.legal === false ? " (not possible: nothing moves)" : "";
     const does = frame.final ? this.ending() : `${actionWords(this.program, frame.action)}${reward}${illegal}`;
-    this.status.textContent = `Step ${this.t} of ${this.frames.length - 1}: ${does}`;
+    this.status.textContent = `Step ${this.t}${this.data.episodes.length ? ` of ${this.frames.length - 1}` : ""}: ${does}`;
     this.drawBoard(frame);
     this.tree.update(frame);
     this.reasons.update(frame, frame.final ? this.ending() : "");
@@ -221,7 +228,7 @@ class Page {
 
   showInputs(frame) {
     const inputs = frame.final ? null : frame.inputs;
-    const [names, few] = [this.program.inputNames, 20];
+    const [names, few] = [this.program.inputNames, matchMedia("(max-width: 700px)").matches ? 8 : 20];
     const shown = this.allInputs || names.length <= few + 4 ? names : names.slice(0, few);
     this.place.inputs.replaceChildren(
       ...shown.map((name, i) => make("tr", {}, make("th", { scope: "row" }, pretty(name)), make("td", { class: inputs && inputs[i] === 0 ? "number silent" : "number" }, inputs ? brief(inputs[i]) : "")))

@@ -1,8 +1,9 @@
 // Small line charts of an episode, with the present step marked; a click goes to a step.
 
 class ChartsView {
-  constructor(container, program, seek) {
-    Object.assign(this, { container, program, seek });
+  // timeline: where the first chart goes, right below the episode; container: where all others go
+  constructor(timeline, container, program, seek) {
+    Object.assign(this, { timeline, container, program, seek });
   }
 
   // Draw the charts of an episode.
@@ -10,40 +11,41 @@ class ChartsView {
     const steps = frames.filter((frame) => !frame.final);
     this.length = Math.max(1, steps.length - 1);
     this.charts = [];
-    const charts = steps.length < 2 ? [make("p", { class: "note" }, "Charts appear after the second step.")] : this.all(steps);
-    this.container.replaceChildren(...charts);
+    const [first, ...others] = steps.length < 2 ? [make("p", { class: "note" }, "")] : this.all(steps);
+    this.timeline.replaceChildren(first);
+    this.container.replaceChildren(...others);
+    this.container.parentElement.hidden = others.length === 0;
   }
 
   all(steps) {
     const { conditions, outputNames, action } = this.program;
     const names = outputNames.map(pretty);
-    const charts = conditions.map((_, index) =>
-      this.lines(`Condition B${index + 1}`, [`B${index + 1}`], [steps.map((step) => step.conditionValues[index])], { zero: true })
-    );
+    const outputs = names.map((_, i) => steps.map((step) => step.outputs[step.branch][i]));
+    const scores = this.lines(action.kind === "box" ? "Outputs, before clipping" : "Scores", names, outputs);
+    const charts = action.kind === "box" ? [scores] : [this.roll("Actions", names, steps.map((step) => chosenOutputs(action, step.action)))];
     if (conditions.length) {
       const rows = this.program.controllers.map((_, index) => (index < conditions.length ? `if B${index + 1}` : "else"));
       charts.push(this.roll("Active branch", rows, steps.map((step) => [step.branch])));
     }
     conditions.forEach(({ cell, readout }, index) => {
+      charts.push(this.lines(`Condition B${index + 1}`, [`B${index + 1}`], [steps.map((step) => step.conditionValues[index])]));
       if (cell === "affine") return;
       const units = readout.map((_, unit) => steps.map((step) => step.memory[index][unit]));
-      charts.push(this.lines(`Memory of B${index + 1}`, units.map((_, unit) => `h${unit + 1}`), units, { zero: true }));
+      charts.push(this.lines(`Memory of B${index + 1}`, units.map((_, unit) => `h${unit + 1}`), units));
     });
-    if (action.kind !== "box") charts.push(this.roll("Actions", names, steps.map((step) => chosenOutputs(action, step.action))));
-    const outputs = names.map((_, i) => steps.map((step) => step.outputs[step.branch][i]));
-    charts.push(this.lines(action.kind === "box" ? "Outputs, before clipping" : "Scores", names, outputs, { zero: true }));
+    if (action.kind !== "box") charts.push(scores);
     if (steps.some(({ reward }) => reward !== 0)) {
       let total = 0;
-      charts.push(this.lines("Return so far", ["return"], [steps.map(({ reward }) => (total += reward))], { zero: true }));
+      charts.push(this.lines("Return so far", ["return"], [steps.map(({ reward }) => (total += reward))]));
     }
     return charts;
   }
 
-  lines(title, names, series, { zero }) {
+  lines(title, names, series) {
     const values = series.flat();
-    let [low, high] = [Math.min(...values, zero ? 0 : Infinity), Math.max(...values, zero ? 0 : -Infinity)];
+    let [low, high] = values.reduce(([least, most], value) => [Math.min(least, value), Math.max(most, value)], [0, 0]);
     if (high - low < 1e-9) [low, high] = [low - 1, high + 1];
-    const y = (value) => (100 * (high - value)) / (high - low);
+    const y = (value) => 5 + (90 * (high - value)) / (high - low);
     const paths = series.map((line, i) =>
       draw("polyline", { points: line.map((value, t) => `${t} ${y(value).toFixed(2)}`).join(" "), class: `series s${i % 8}` })
     );

@@ -7,7 +7,7 @@ const CELLS = { rnn: "RNN", gru: "GRU", lstm: "LSTM" };
 function formula(constant, weights, names, most) {
   const terms = weights.map((weight, index) => ({ weight, name: names[index] })).filter(({ weight }) => weight !== 0);
   terms.sort((a, b) => Math.abs(b.weight) - Math.abs(a.weight));
-  const parts = constant !== 0 || terms.length === 0 ? [make("span", { class: "term" }, show(constant))] : [];
+  const parts = constant !== 0 || terms.length === 0 ? [make("span", { class: "term" }, brief(constant))] : [];
   for (const { weight, name } of terms.slice(0, most)) {
     const sign = weight < 0 ? MINUS : parts.length ? "+" : "";
     const size = make("b", { class: weight < 0 ? "lowers" : "raises" }, `${sign}${parts.length ? "\u00a0" : ""}${brief(Math.abs(weight))}`);
@@ -42,7 +42,8 @@ class ProgramView {
       this.container.querySelector("button").focus();
     };
     const button = make("button", { type: "button", class: "quiet", onclick: toggle }, this.all ? "Show fewer terms" : "Show all terms");
-    this.container.replaceChildren(spine, ...(hides ? [button] : []));
+    this.scroller = make("div", { class: "scroller" }, spine);
+    this.container.replaceChildren(this.scroller, ...(hides ? [button] : []));
   }
 
   test(conditions, index) {
@@ -100,10 +101,18 @@ class ProgramView {
       const chosen = frame.final || index !== frame.branch ? [] : chosenOutputs(this.program.action, frame.action);
       this.lines[index].forEach((line, i) => line.classList.toggle("chosen", chosen.includes(i)));
     });
+    this.reveal(this.branches[frame.branch]);
     this.values.forEach((output, index) => {
       const value = frame.final ? null : frame.conditionValues[index];
       output.textContent = value === null ? "" : `${show(value)} ${value >= 0 ? "yes" : "no"}`;
     });
+  }
+
+  // Scroll the tree, and never the page, to the active branch.
+  reveal(branch) {
+    if (!branch || this.scroller.scrollHeight <= this.scroller.clientHeight) return;
+    const [outer, inner] = [this.scroller.getBoundingClientRect(), branch.getBoundingClientRect()];
+    if (inner.top < outer.top || inner.bottom > outer.bottom) this.scroller.scrollTop += inner.top - outer.top - 8;
   }
 }
 
@@ -123,5 +132,5 @@ function chosenOutputs({ kind, sizes, start }, action) {
 function actionWords(program, action) {
   if (program.action.kind === "box") return action.map((value) => show(value)).join(", ");
   const names = chosenOutputs(program.action, action).map((index) => pretty(program.outputNames[index]));
-  return names.join(", ") || "nothing";
+  return names.join(", ") || "all off";
 }
