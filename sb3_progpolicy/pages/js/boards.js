@@ -150,7 +150,7 @@ BOARDS["Stacking-v0"] = {
     if (frame.final) return null;
     if (frame.action === 4) return draw("circle", { cx: x, cy: y, r: 27, class: "pick" });
     const [down, right] = COMPASS[frame.action];
-    return arrow(x + 14 * right, y + 14 * down, x + 0.8 * cell * right, y + 0.8 * cell * down);
+    return arrow(x + 14 * right, y + 14 * down, x + 0.72 * cell * right, y + 0.72 * cell * down);
   },
 
   press(frame, place, desk) {
