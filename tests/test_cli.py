@@ -137,6 +137,7 @@ def test_run_model_and_program_are_the_same_source(trained, capsys):
         ("dot", "digraph"),
         ("python", '"""'),
         ("javascript", "class ProgramPolicy"),
+        ("html", "<!DOCTYPE html>"),
     ],
 )
 def test_show_prints_every_format(format_, start, program, tmp_path, capsys):

@@ -45,12 +45,12 @@ def export_html(
     :param seed: of the episodes
     :return: the page if ``out_file`` is ``None``, else ``None``
     :raises ValueError: if the program is not well formed
-    :raises ImportError: if Jinja2 or markdown-it-py is missing
+    :raises ModuleNotFoundError: if Jinja2 or markdown-it-py is missing, or what the environment needs
     """
     try:
         from jinja2 import Environment, PackageLoader, StrictUndefined
     except ImportError as error:
-        raise ImportError('pages need Jinja2: pip install "sb3-progpolicy[page]"') from error
+        raise ModuleNotFoundError('pages need Jinja2: pip install "sb3-progpolicy[page]"') from error
     source = export_javascript(program)
     domain = find_domain(_env_id(program))
     with _environment(program, domain, dict(env_kwargs or {})) as env:
@@ -166,7 +166,7 @@ def _markup(text: str) -> Any:
     try:
         from markdown_it import MarkdownIt
     except ImportError as error:
-        raise ImportError('pages need markdown-it-py: pip install "sb3-progpolicy[page]"') from error
+        raise ModuleNotFoundError('pages need markdown-it-py: pip install "sb3-progpolicy[page]"') from error
     from markupsafe import Markup
 
     return Markup(MarkdownIt("commonmark", {"html": False}).enable("table").render(text))

@@ -1,6 +1,5 @@
 """Pages in headless Chromium: no error, no request, and keys and clicks do what they say."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -210,11 +209,10 @@ def test_hostile_names_are_shown_as_they_are(visit, tab):
     rng = np.random.default_rng(1)
     for _ in range(5):
         program = with_hostile_texts(small_program(rng), rng)
-        names = ('<img src=x onerror="document.title=1">', "</script><script>document.title=2</script>")
+        names = ('<img src=x onerror="document.title=1">', "</script ><script>document.title=2</script >")
         program = replace(program, input_names=(*names, *program.input_names[2:])[: program.n_inputs])
         visit(program)
         assert tab.errors == []
         assert tab.evaluate("document.title") not in ("1", "2")
         shown = tab.evaluate("[...document.querySelectorAll('#inputs th')].map((cell) => cell.textContent)")
-        assert shown[0] == names[0]
-        assert json.dumps(shown)
+        assert shown[: len(names)] == list(program.input_names[: len(names)])
