@@ -48,7 +48,8 @@ def record_episodes(
     :param seed: of every episode
     :return: one mapping for each episode
     """
-    episodes, size = [], 0
+    episodes: list[dict[str, Any]] = []
+    size = 0
     for kind, variation in _variations(domain):
         episode = _record(program, env, variation, in_page, seed)
         size += sum(len(value) for value in episode.values() if isinstance(value, str))
@@ -84,7 +85,7 @@ def _record(
         reward, done = np.float32(earned), terminated or truncated
         actions.append(action[0])
         rewards.append(reward)
-    episode = {
+    episode: dict[str, Any] = {
         "success": bool(info.get("is_success", False)),
         "steps": len(actions),
         "optimal": None if optimal is None else int(optimal),
@@ -112,8 +113,9 @@ class _Scene:
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
-        self._env: Any = env.unwrapped
-        task = self._env.task
+        bare: Any = env.unwrapped
+        self._env = bare
+        task = bare.task
         self._targets = [list(target) for target in task.targets]
         self._has_objects = task.kind is not None
         self._table = {"low": task.table.low_x, "high": task.table.high_x, "width": task.table.width}
