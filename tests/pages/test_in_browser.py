@@ -100,7 +100,7 @@ def test_buttons_and_sliders_do_the_same(visit, tab):
 def test_every_term_is_accounted_for(visit, tab):
     program = load_pretrained("Stacking-v0")
     visit(program, "step=7")
-    tab.click(".score:nth-child(2)")
+    tab.click('[data-thing="1"]')
     toggle = "document.querySelector('#reasons button.quiet')"
     if tab.evaluate(f"{toggle} !== null"):
         tab.click("#reasons button.quiet")
@@ -111,6 +111,22 @@ def test_every_term_is_accounted_for(visit, tab):
     assert sum(values) == pytest.approx(total, abs=0.005 * len(values) + 0.005)
     silent = tab.evaluate("document.querySelector('#reasons .note').textContent")
     assert len(values) + int(silent.split()[0]) == program.n_inputs + 1
+
+
+def test_the_terms_of_a_condition_are_shown_as_those_of_a_score_are(visit, tab):
+    program = hanoi_program(3, "gru")
+    visit(program, "step=4")
+    tab.click('[data-thing="B2"]')
+    names = tab.evaluate("[...document.querySelectorAll('.reason .name')].map((name) => name.firstChild.textContent)")
+    assert {name for name in names if name.startswith("memory")} == {
+        f"memory h{unit + 1}" for unit, weight in enumerate(program.conditions[1].readout) if weight
+    }
+    values = tab.evaluate("[...document.querySelectorAll('.reason .number')].map((cell) => cell.textContent)")
+    *terms, total = (float(text.replace("\N{MINUS SIGN}", "-")) for text in values)
+    assert sum(terms) == pytest.approx(total, abs=0.03)
+    assert total == pytest.approx(tab.evaluate("page.frames[4].conditionValues[1]"), abs=0.006)
+    tab.click('[data-thing="B2"]')
+    assert "move" in tab.evaluate("document.querySelector('#reasons h3 em').textContent")
 
 
 def test_a_disc_is_moved_by_two_clicks_and_the_program_starts_from_there(visit, tab):

@@ -60,7 +60,7 @@ BOARDS["Hanoi-v0"] = {
     const top = (peg) => floor - heights[peg] * thickness - 8;
     return board(
       480,
-      222,
+      228,
       `Tower of Hanoi. ${this.words(frame.state)}`,
       draw("rect", { x: 8, y: floor, width: 464, height: 7, rx: 3.5, class: "wood" }),
       pegs,

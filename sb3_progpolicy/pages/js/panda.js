@@ -20,7 +20,7 @@ function readScene({ scene, steps }) {
     const values = points.map((point) => point[axis]);
     return [Math.min(low, ...values) - 0.05, Math.max(high, ...values) + 0.05];
   };
-  return { frames, targets: scene.targets, x: reach(0, -0.1, 0.1), y: reach(1, -0.2, 0.2), z: [-0.02, reach(2, 0, 0.2)[1]] };
+  return { frames, targets: scene.targets, x: reach(0, -0.1, 0.1), y: reach(1, -0.2, 0.2), z: [-0.04, reach(2, 0, 0.2)[1]] };
 }
 
 // Two views that share their horizontal axis, y: from above, and from the robot.
@@ -35,21 +35,20 @@ function drawScene(scene, t) {
   const above = (point) => [across(point), label + (scene.x[1] - point[0]) * scale];
   const aside = (point) => [across(point), top + (scene.z[1] - point[2]) * scale];
   const now = scene.frames[t];
-  const view = (place, y, height, name) => [
+  const view = (place, y, height, name, floor) => [
     draw("text", { x: 0, y: y - 9, class: "label left" }, name),
     draw("rect", { x: 0.5, y, width: width - 1, height, rx: 6, class: "panel" }),
+    floor === null ? null : draw("line", { x1: 1, x2: width - 1, y1: floor, y2: floor, class: "floor" }),
     trail(scene, t, place),
     scene.targets.map((target, i) => mark(place(target), i, now.finished[i], scale)),
     now.objects.map((object, i) => block(place(object), i, scale)),
     hand(place(now.gripper), now.fingers, scale),
   ];
-  const ground = top + scene.z[1] * scale;
   const left = now.finished.filter((done) => !done).length;
   return board(
     width, top + sideHeight + 1, `Robot scene. ${left} of ${scene.targets.length} unfinished`,
-    view(above, label, topHeight, "from above"),
-    draw("rect", { x: 0, y: ground, width, height: 1.5, class: "wood" }),
-    view(aside, top, sideHeight, "from the robot")
+    view(above, label, topHeight, "from above", null),
+    view(aside, top, sideHeight, "from the robot", top + scene.z[1] * scale)
   );
 }
 

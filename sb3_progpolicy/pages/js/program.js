@@ -3,7 +3,7 @@
 const FEW_TERMS = 4;
 const CELLS = { rnn: "RNN", gru: "GRU", lstm: "LSTM" };
 
-// A sum as text, the largest terms first; what is zero is left out, and what is small only counted.
+// A sum as text, the largest terms first; what is zero is left out, and what comes after `most` only counted.
 function formula(constant, weights, names, most) {
   const terms = weights.map((weight, index) => ({ weight, name: names[index] })).filter(({ weight }) => weight !== 0);
   terms.sort((a, b) => Math.abs(b.weight) - Math.abs(a.weight));
@@ -14,7 +14,7 @@ function formula(constant, weights, names, most) {
     parts.push(make("span", { class: "term" }, size, "\u00a0", pretty(name)));
   }
   const left = terms.length - most;
-  if (left > 0) parts.push(make("span", { class: "term rest" }, `+ ${counted(left, "smaller term")}`));
+  if (left > 0) parts.push(make("span", { class: "term rest" }, `+ ${counted(left, "more term")}`));
   return parts.flatMap((part) => [part, " "]);
 }
 
@@ -104,7 +104,7 @@ class ProgramView {
     this.reveal(this.branches[frame.branch]);
     this.values.forEach((output, index) => {
       const value = frame.final ? null : frame.conditionValues[index];
-      output.textContent = value === null ? "" : `${show(value)} ${value >= 0 ? "yes" : "no"}`;
+      output.textContent = value === null ? "" : `${brief(value)} ${value >= 0 ? "yes" : "no"}`;
     });
   }
 

@@ -1,4 +1,4 @@
-// Why the program decides as it does: every output's score, and what each term adds to one of them.
+// Why the program decides as it does: every condition's and output's value, and what each term adds to one of them.
 
 const FEW_REASONS = 7;
 
@@ -14,7 +14,7 @@ class ReasonsView {
       this.container.replaceChildren(make("p", { class: frame.success ? "verdict-line reached" : "verdict-line" }, ending));
       return;
     }
-    this.container.replaceChildren(this.sentence(), this.scores(), ...this.terms());
+    this.container.replaceChildren(this.sentence(), ...this.tests(), this.scores(), ...this.terms());
   }
 
   sentence() {
@@ -39,67 +39,92 @@ class ReasonsView {
     return outputs.reduce((best, value, i) => (Math.abs(value) > Math.abs(outputs[best]) ? i : best), 0);
   }
 
-  pick(index) {
-    this.picked = this.picked === index ? null : index;
+  // Show what adds up to an output, by its index, or to a condition, by a name such as "B1".
+  pick(thing) {
+    this.picked = this.picked === thing ? null : thing;
     this.update(this.frame, this.ending);
-    this.container.querySelectorAll(".score")[index].focus();
+    this.container.querySelector(`[data-thing="${thing}"]`).focus();
+  }
+
+  // The values of the conditions; the first that is not below 0 decides.
+  tests() {
+    const { conditionValues, branch } = this.frame;
+    if (conditionValues.length === 0) return [];
+    const widest = Math.max(...conditionValues.map(Math.abs), 1e-9);
+    const rows = conditionValues.map((value, i) => {
+      const verdict = i < branch ? "no" : i === branch ? "yes: decides" : null;
+      return this.choice(`B${i + 1}`, `B${i + 1} \u2265 0`, verdict, value, widest, i === branch);
+    });
+    return [make("div", { class: "tests", role: "group", "aria-label": "Values of all conditions" }, rows)];
   }
 
   scores() {
-    const { program } = this.policy;
+    const { action, outputNames } = this.policy.program;
     const outputs = this.frame.outputs[this.frame.branch];
-    const [chosen, focus] = [chosenOutputs(program.action, this.frame.action), this.focus()];
+    const chosen = chosenOutputs(action, this.frame.action);
     const widest = Math.max(...outputs.map(Math.abs), 1e-9);
     const rows = outputs.map((value, i) => {
-      const [low, high] = program.action.kind === "box" ? [program.action.low[i], program.action.high[i]] : [-Infinity, Infinity];
+      const [low, high] = action.kind === "box" ? [action.low[i], action.high[i]] : [-Infinity, Infinity];
       const clipped = value < low ? `clipped to ${brief(low)}` : value > high ? `clipped to ${brief(high)}` : null;
-      return make(
-        "button",
-        {
-          type: "button",
-          class: chosen.includes(i) ? "score chosen" : "score",
-          "aria-pressed": String(i === focus),
-          "aria-label": `${pretty(program.outputNames[i])}: ${show(value)}${clipped ? `, ${clipped}` : ""}`,
-          onclick: () => this.pick(i),
-        },
-        make("span", { class: "name" }, pretty(program.outputNames[i]), clipped ? make("small", {}, clipped) : null),
-        bar(value, widest),
-        make("span", { class: "number" }, show(value))
-      );
+      return this.choice(i, pretty(outputNames[i]), clipped, value, widest, chosen.includes(i));
     });
     return make("div", { class: "scores", role: "group", "aria-label": "Scores of all outputs" }, rows);
   }
 
-  // Every term of one output, the largest first; together with the constant they are the score.
-  terms() {
+  choice(thing, name, note, value, widest, chosen) {
+    const label = `${name}: ${show(value)}${note ? `, ${note}` : ""}`;
+    return make(
+      "button",
+      {
+        type: "button", class: chosen ? "score chosen" : "score", "data-thing": thing, "aria-label": label,
+        "aria-pressed": String(thing === this.focus()), onclick: () => this.pick(thing),
+      },
+      make("span", { class: "name" }, name, note ? make("small", {}, note) : null),
+      bar(value, widest),
+      make("span", { class: "number" }, show(value))
+    );
+  }
+
+  // The sum that is shown: a name, a constant, and weights with what they are multiplied by.
+  sum() {
     const { program } = this.policy;
-    const [index, { branch, inputs }] = [this.focus(), this.frame];
-    const { weights, bias } = program.controllers[branch];
-    const added = this.policy.contributions(inputs, branch)[index];
-    const terms = added.map((value, j) => ({ value, name: pretty(program.inputNames[j]), product: `${brief(weights[index][j])} \u00d7 ${brief(inputs[j])}` }));
-    const silent = terms.filter(({ value }, j) => value === 0 && weights[index][j] !== 0).length;
+    const { inputs, branch, outputs, memory, conditionValues } = this.frame;
+    const thing = this.focus();
+    if (typeof thing === "number") {
+      const { weights, bias } = program.controllers[branch];
+      return { name: program.outputNames[thing], total: outputs[branch][thing], constant: bias[thing], weights: weights[thing], values: inputs, names: program.inputNames };
+    }
+    const index = Number(thing.slice(1)) - 1;
+    const { cell, readout, readoutBias } = program.conditions[index];
+    const [values, names] = cell === "affine" ? [inputs, program.inputNames] : [memory[index], readout.map((_, unit) => `memory h${unit + 1}`)];
+    return { name: thing, total: conditionValues[index], constant: readoutBias, weights: readout, values, names };
+  }
+
+  // Every term of one sum, the largest first; together with the constant they are its value.
+  terms() {
+    const { name: subject, total, constant, weights, values, names } = this.sum();
+    const terms = weights.map((weight, j) => ({ value: weight * values[j], name: pretty(names[j]), product: `${brief(weight)} \u00d7 ${brief(values[j])}` }));
+    const silent = terms.filter(({ value }, j) => value === 0 && weights[j] !== 0).length;
     const heard = terms.filter(({ value }) => value !== 0);
-    if (bias[index] !== 0) heard.push({ value: bias[index], name: "constant", product: "" });
+    if (constant !== 0) heard.push({ value: constant, name: "constant", product: "" });
     heard.sort((a, b) => Math.abs(b.value) - Math.abs(a.value));
     const shown = this.all || heard.length <= FEW_REASONS + 1 ? heard : heard.slice(0, FEW_REASONS);
     const rest = heard.slice(shown.length);
     const widest = Math.max(...heard.map(({ value }) => Math.abs(value)), 1e-9);
-    const total = this.frame.outputs[branch][index];
     const rows = shown.map(({ value, name, product }) => this.row(name, product, value, widest));
     if (rest.length) {
       const sum = rest.reduce((sum, { value }) => sum + value, 0);
-      rows.push(this.row(counted(rest.length, "smaller term"), "", sum, widest, "rest"));
+      rows.push(this.row(counted(rest.length, "further term"), "", sum, widest, "rest"));
     }
     const toggle = () => {
       this.all = !this.all;
       this.update(this.frame, this.ending);
-      this.container.querySelector("button.quiet").focus();
+      this.container.querySelector("button.quiet")?.focus();
     };
     const many = heard.length > FEW_REASONS + 1;
     return [
-      make("h3", {}, "What adds up to ", make("em", {}, pretty(program.outputNames[index]))),
-      make("div", { class: "terms", role: "list", "aria-label": "Terms, the largest first" }, rows,
-        this.row("sum", "", total, null, "total")),
+      make("h3", {}, "What adds up to ", make("em", {}, pretty(subject))),
+      make("div", { class: "terms", role: "list", "aria-label": "Terms, the largest first" }, rows, this.row("sum", "", total, null, "total")),
       many ? make("button", { type: "button", class: "quiet", onclick: toggle }, this.all ? "Show fewer terms" : `Show all ${heard.length} terms`) : null,
       silent ? make("p", { class: "note" }, `${counted(silent, "more term")} ${silent === 1 ? "adds" : "add"} nothing now, since the input is 0.`) : null,
     ].filter((part) => part !== null);
