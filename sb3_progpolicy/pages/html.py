@@ -20,7 +20,7 @@ from sb3_progpolicy.programs.export.visitor import action_rule, counted, deliver
 from sb3_progpolicy.programs.syntax import ProgramData
 
 #: In the order in which the page runs them; each uses only what stands before it.
-SCRIPTS = ("worlds", "episode", "dom", "boards", "panda", "program", "reasons", "charts", "app")
+SCRIPTS = ("worlds", "episode", "dom", "boards", "panda", "program", "reasons", "charts", "inputs", "app")
 _GLOSSARY = ("Observation Space", "Action Space", "Rewards")
 
 

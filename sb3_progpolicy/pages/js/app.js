@@ -1,26 +1,41 @@
 // The page: one episode at one step, and everything that shows it.
 
+const PLACES = [
+  "tree", "variation", "board", "transport", "timeline", "hint", "announcer", "reasons", "charts", "inputs",
+  "more-inputs",
+];
+const KINDS = { trained: "training", validation: "validation, not trained on", unseen: "unseen in training" };
+const QUESTION =
+  "Set the inputs: the program answers at once. A step forward keeps the answer and asks again; the program " +
+  "remembers what it has read.";
+
 class Page {
   constructor(data) {
     this.data = data;
     this.policy = new ProgramPolicy();
     this.program = this.policy.program;
-    this.place = Object.fromEntries(
-      ["tree", "variation", "board", "transport", "hint", "announcer", "reasons", "timeline", "charts", "inputs", "more-inputs"].map((id) => [id, document.getElementById(id)])
-    );
+    this.place = Object.fromEntries(PLACES.map((id) => [id, document.getElementById(id)]));
     this.selected = null;
-    this.allInputs = false;
     this.tree = new ProgramView(this.place.tree, this.program, data.importance);
     this.reasons = new ReasonsView(this.place.reasons, this.policy);
     this.charts = new ChartsView(this.place.timeline, this.place.charts, this.program, (t) => this.seek(t));
+    this.inputs = new InputsView(this.place.inputs, this.place["more-inputs"], this.program.inputNames);
     this.makeTransport();
-    if (data.episodes.length) this.makeVariations();
-    else this.makeQuestion();
-    const wish = new URLSearchParams(location.hash.slice(1));
-    if (data.episodes.length) this.open(Math.min(Number(wish.get("episode") ?? this.firstEpisode()), data.episodes.length - 1));
-    else this.ask([new Array(this.program.nObservations).fill(0)], 0);
-    this.seek(Number(wish.get("step") || 0));
+    this.start(new URLSearchParams(location.hash.slice(1)));
     document.addEventListener("keydown", (event) => this.press(event));
+  }
+
+  // wish: what the address asks for, as in page.html#episode=3&step=10
+  start(wish) {
+    const last = this.data.episodes.length - 1;
+    if (last >= 0) {
+      this.makeVariations(last);
+      this.open(Math.min(Number(wish.get("episode") ?? this.firstEpisode()), last));
+    } else {
+      this.makeQuestion();
+      this.ask([new Array(this.program.nObservations).fill(0)], 0);
+    }
+    this.seek(Number(wish.get("step") || 0));
   }
 
   // The largest training variation: long enough to be worth a look.
@@ -32,7 +47,9 @@ class Page {
     const episode = this.data.episodes[index];
     const world = WORLDS[this.data.world];
     Object.assign(this, { index, episode, edited: false, selected: null, scene: null });
-    this.frames = world ? simulate(this.policy, new world(episode.start), episode.actions) : replay(this.policy, episode);
+    this.frames = world
+      ? simulate(this.policy, new world(episode.start), episode.actions)
+      : replay(this.policy, episode);
     if (episode.scene) this.scene = readScene(episode);
     this.begin(0);
   }
@@ -42,8 +59,7 @@ class Page {
     Object.assign(this, { edited: true, selected: null });
     this.frames = simulate(this.policy, new WORLDS[this.data.world](state));
     this.begin(0);
-    const { success } = this.frames[this.frames.length - 1];
-    this.announce(`Your state. The program ${success ? "reaches the goal" : "does not reach the goal"} in ${counted(this.frames.length - 1, "step")}.`);
+    this.announce(`Your state. ${this.ending()}`);
   }
 
   // Answer inputs that the reader has set.
@@ -69,7 +85,7 @@ class Page {
   step(by) {
     this.stop();
     this.selected = null;
-    const asked = !this.data.episodes.length && by > 0 && this.t === this.frames.length - 1;
+    const asked = this.question && by > 0 && this.t === this.frames.length - 1;
     if (asked) this.ask([...this.observations, this.observations[this.t]], this.t + 1);
     else this.seek(this.t + by);
     this.announce(this.status.textContent);
@@ -121,39 +137,56 @@ class Page {
     this.player = button("Play", "play", () => this.play());
     this.player.classList.add("player");
     const forward = button("Step forward", "forward", () => this.step(1));
-    this.scrubber = make("input", { type: "range", min: 0, value: 0, "aria-label": "Step", oninput: () => (this.stop(), this.seek(Number(this.scrubber.value))) });
+    this.scrubber = make("input", { type: "range", min: 0, value: 0, "aria-label": "Step" });
+    this.scrubber.addEventListener("input", () => {
+      this.stop();
+      this.seek(Number(this.scrubber.value));
+    });
     this.status = make("p", { class: "status" });
-    this.place.transport.append(make("div", { class: "controls" }, first, back, this.player, forward, this.scrubber), this.status);
+    const controls = make("div", { class: "controls" }, first, back, this.player, forward, this.scrubber);
+    this.place.transport.append(controls, this.status);
   }
 
-  makeVariations() {
-    const last = this.data.episodes.length - 1;
-    this.slider = make("input", { type: "range", min: 0, max: last, "aria-label": "Variation", oninput: () => this.open(Number(this.slider.value)) });
+  makeVariations(last) {
+    this.slider = make("input", { type: "range", min: 0, max: last, "aria-label": "Variation" });
+    this.slider.addEventListener("input", () => this.open(Number(this.slider.value)));
     const marks = this.data.episodes.map(({ kind }) => make("i", { class: kind }));
     this.label = make("p", { class: "variation-label" });
-    this.place.variation.append(this.label, last ? make("div", { class: "slider" }, this.slider, make("div", { class: "marks", "aria-hidden": "true" }, marks)) : "");
-    if (BOARDS[this.data.world]) {
-      this.place.hint.textContent = BOARDS[this.data.world].hint;
-      this.place.hint.hidden = false;
+    this.place.variation.append(this.label);
+    if (last > 0) {
+      const track = make("div", { class: "marks", "aria-hidden": "true" }, marks);
+      this.place.variation.append(make("div", { class: "slider" }, this.slider, track));
     }
+    if (BOARDS[this.data.world]) this.hint(BOARDS[this.data.world].hint);
   }
 
   makeQuestion() {
     this.player.hidden = true;
-    this.place.hint.textContent = "Set the inputs: the program answers at once. A step forward keeps the answer and asks again; the program remembers what it has read.";
+    this.hint(QUESTION);
+    const names = this.program.inputNames.slice(0, this.program.nObservations);
+    this.question = new QuestionView(this.place.board, names, (index, value) => {
+      const observations = this.observations.slice(0, this.t + 1);
+      observations[this.t] = observations[this.t].map((old, i) => (i === index ? value : old));
+      this.ask(observations, this.t);
+    });
+  }
+
+  hint(text) {
+    this.place.hint.textContent = text;
     this.place.hint.hidden = false;
   }
 
   showVariation() {
-    if (!this.data.episodes.length) return;
+    if (this.question) return;
     const words = this.edited ? "Your state" : variationWords(this.episode.variation, this.data.size);
-    const kind = { trained: "training", validation: "validation, not trained on", unseen: "unseen in training" }[this.episode.kind];
+    const kind = KINDS[this.episode.kind];
+    const back = { type: "button", class: "quiet", onclick: () => this.open(this.index) };
     this.slider.value = this.index;
     this.slider.setAttribute("aria-valuetext", `${words}, ${kind}`);
     this.label.replaceChildren(
       make("strong", {}, words),
       this.edited
-        ? make("button", { type: "button", class: "quiet", onclick: () => this.open(this.index) }, "Back to the recorded episode")
+        ? make("button", back, "Back to the recorded episode")
         : make("span", { class: `tag ${this.episode.kind}` }, kind)
     );
   }
@@ -166,31 +199,41 @@ class Page {
   }
 
   ending() {
-    const steps = counted(this.frames.length - 1, "step");
+    const reached = this.frames[this.frames.length - 1].success ? "Goal reached" : "Goal not reached";
     const best = this.edited || this.episode.optimal === null ? "" : ` The planner needs ${this.episode.optimal}.`;
-    return this.frames[this.frames.length - 1].success ? `Goal reached in ${steps}.${best}` : `Goal not reached in ${steps}.${best}`;
+    return `${reached} in ${counted(this.frames.length - 1, "step")}.${best}`;
   }
 
   show() {
     const frame = this.frames[this.t];
     this.scrubber.value = this.t;
     this.scrubber.setAttribute("aria-valuetext", `step ${this.t} of ${this.frames.length - 1}`);
-    const reward = frame.final || !this.data.episodes.length ? "" : `, reward ${signed(frame.reward)}`;
-    const illegal = frame.legal === false ? " (not possible: nothing moves)" : "";
-    const does = frame.final ? this.ending() : `${actionWords(this.program, frame.action)}${reward}${illegal}`;
-    this.status.textContent = `Step ${this.t}${this.data.episodes.length ? ` of ${this.frames.length - 1}` : ""}: ${does}`;
+    this.status.textContent = this.words(frame);
     this.drawBoard(frame);
     this.tree.update(frame);
     this.reasons.update(frame, frame.final ? this.ending() : "");
     this.charts.update(this.t);
-    this.showInputs(frame);
+    this.inputs.update(frame);
+  }
+
+  // The step in one sentence.
+  words(frame) {
+    if (this.question) return `Step ${this.t}: ${actionWords(this.program, frame.action)}`;
+    const step = `Step ${this.t} of ${this.frames.length - 1}`;
+    if (frame.final) return `${step}: ${this.ending()}`;
+    const illegal = frame.legal === false ? " (not possible: nothing moves)" : "";
+    return `${step}: ${actionWords(this.program, frame.action)}, reward ${signed(frame.reward)}${illegal}`;
   }
 
   drawBoard(frame) {
-    const kept = document.activeElement && document.activeElement.getAttribute("data-key");
+    if (this.question) {
+      this.question.update(frame);
+      return;
+    }
+    const kept = document.activeElement?.getAttribute("data-key");
+    const world = BOARDS[this.data.world];
     if (this.scene) this.place.board.replaceChildren(drawScene(this.scene, frame.index));
-    else if (BOARDS[this.data.world]) this.place.board.replaceChildren(BOARDS[this.data.world].draw(frame, this, this.frames.slice(0, this.t)));
-    else if (!this.data.episodes.length) this.drawSliders(frame);
+    else if (world) this.place.board.replaceChildren(world.draw(frame, this, this.frames.slice(0, this.t)));
     if (kept) this.place.board.querySelector(`[data-key="${kept}"]`)?.focus();
   }
 
@@ -199,47 +242,6 @@ class Page {
     this.stop();
     this.selected = thing;
     this.show();
-  }
-
-  drawSliders(frame) {
-    const rows = frame.observation.map((value, i) => {
-      const set = (input) => {
-        const observations = this.observations.slice(0, this.t + 1);
-        if (!Number.isFinite(input.valueAsNumber)) return;
-        observations[this.t] = frame.observation.map((old, j) => (j === i ? input.valueAsNumber : old));
-        this.ask(observations, this.t);
-      };
-      const name = pretty(this.program.inputNames[i]);
-      const make_ = (kind, key) => make("input", { type: kind, min: kind === "range" ? -1 : null, max: kind === "range" ? 1 : null, step: kind === "range" ? 0.01 : "any", value, "aria-label": name, "data-key": `${key}${i}`, oninput: (event) => set(event.target) });
-      return make("div", { class: "input-row" }, make("span", {}, name), make_("range", "range"), make_("number", "number"));
-    });
-    if (this.sliderFor === frame.observation.length && this.place.board.contains(document.activeElement)) {
-      // Do not take the slider away that is being moved.
-      frame.observation.forEach((value, i) => {
-        for (const input of this.place.board.querySelectorAll(`[data-key$="e${i}"], [data-key="number${i}"]`)) {
-          if (input !== document.activeElement) input.value = value;
-        }
-      });
-      return;
-    }
-    this.sliderFor = frame.observation.length;
-    this.place.board.replaceChildren(make("div", { class: "input-rows" }, rows));
-  }
-
-  showInputs(frame) {
-    const inputs = frame.final ? null : frame.inputs;
-    const [names, few] = [this.program.inputNames, matchMedia("(max-width: 700px)").matches ? 8 : 20];
-    const shown = this.allInputs || names.length <= few + 4 ? names : names.slice(0, few);
-    this.place.inputs.replaceChildren(
-      ...shown.map((name, i) => make("tr", {}, make("th", { scope: "row" }, pretty(name)), make("td", { class: inputs && inputs[i] === 0 ? "number silent" : "number" }, inputs ? brief(inputs[i]) : "")))
-    );
-    const more = this.place["more-inputs"];
-    more.hidden = names.length <= few + 4;
-    more.textContent = this.allInputs ? "Show fewer" : `Show all ${names.length} inputs`;
-    more.onclick = () => {
-      this.allInputs = !this.allInputs;
-      this.showInputs(frame);
-    };
   }
 }
 

@@ -16,13 +16,16 @@ function arrow(x1, y1, x2, y2, curve = 0) {
 }
 
 function board(width, height, label, ...parts) {
-  return draw("svg", { viewBox: `0 0 ${width} ${height}`, class: "board", role: "group", "aria-label": label }, ...parts);
+  const look = { viewBox: `0 0 ${width} ${height}`, class: "board", role: "group", "aria-label": label };
+  return draw("svg", look, ...parts);
 }
 
 const BOARDS = {};
 
 BOARDS["Hanoi-v0"] = {
-  hint: "Change the state: click a peg to lift its top disc, then another peg to put it down. The program starts anew from there.",
+  hint:
+    "Change the state: click a peg to lift its top disc, then another peg to put it down. The program starts anew " +
+    "from there.",
 
   words({ discs }) {
     const at = (peg) => discs.flatMap((where, disc) => (where === peg ? [disc + 1] : [])).join(" ") || "empty";
@@ -54,7 +57,8 @@ BOARDS["Hanoi-v0"] = {
         heights[peg] += 1;
         const y = floor - heights[peg] * thickness - (lifted ? 12 : 0);
         const look = `disc ${disc % 2 ? "light" : "dark"}${lifted ? " lifted" : ""}`;
-        return draw("rect", { x: centres[peg] - half, y, width: 2 * half, height: thickness - 1.5, rx: 5, class: look });
+        const size = { width: 2 * half, height: thickness - 1.5, rx: 5 };
+        return draw("rect", { x: centres[peg] - half, y, ...size, class: look });
       });
     const move = frame.final ? null : Hanoi.moves[frame.action];
     const top = (peg) => floor - heights[peg] * thickness - 8;
@@ -89,10 +93,13 @@ BOARDS["Hanoi-v0"] = {
 const PLATE_COLOURS = ["#b22234", "#d9682a", "#c99514", "#5d9436", "#278c82", "#2f6fb4", "#6250ad", "#a0468c"];
 
 BOARDS["Stacking-v0"] = {
-  hint: "Change the state: click a cell to put the gripper there. Click a plate, then an empty cell, to move the plate; click it twice to put the gripper above it.",
+  hint:
+    "Change the state: click a cell to put the gripper there. Click a plate, then an empty cell, to move the plate; " +
+    "click it twice to put the gripper above it.",
 
   words({ plates, gripper, n_plates: total }) {
-    return `${counted(plates.length, "plate")} on the table, ${total - plates.length} on the stack, gripper at row ${gripper[0]}, column ${gripper[1]}`;
+    const where = `gripper at row ${gripper[0]}, column ${gripper[1]}`;
+    return `${counted(plates.length, "plate")} on the table, ${total - plates.length} on the stack, ${where}`;
   },
 
   draw(frame, desk) {
@@ -172,7 +179,8 @@ BOARDS["Stacking-v0"] = {
 };
 
 BOARDS["Hiking-v0"] = {
-  hint: "Change the state: click a pathway cell to add or remove a star. Click the hiker, then a cell, to move the hiker.",
+  hint:
+    "Change the state: click a pathway cell to add or remove a star. Click the hiker, then a cell, to move the hiker.",
   seesWindow: false,
 
   words({ hiker, stars }) {

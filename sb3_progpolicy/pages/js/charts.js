@@ -22,16 +22,18 @@ class ChartsView {
     const names = outputNames.map(pretty);
     const outputs = names.map((_, i) => steps.map((step) => step.outputs[step.branch][i]));
     const scores = this.lines(action.kind === "box" ? "Outputs, before clipping" : "Scores", names, outputs);
-    const charts = action.kind === "box" ? [scores] : [this.roll("Actions", names, steps.map((step) => chosenOutputs(action, step.action)))];
+    const actions = () => this.roll("Actions", names, steps.map((step) => chosenOutputs(action, step.action)));
+    const charts = [action.kind === "box" ? scores : actions()];
     if (conditions.length) {
-      const rows = this.program.controllers.map((_, index) => (index < conditions.length ? `if B${index + 1}` : "else"));
+      const rows = [...conditions.map((_, index) => `if B${index + 1}`), "else"];
       charts.push(this.roll("Active branch", rows, steps.map((step) => [step.branch])));
     }
     conditions.forEach(({ cell, readout }, index) => {
-      charts.push(this.lines(`Condition B${index + 1}`, [`B${index + 1}`], [steps.map((step) => step.conditionValues[index])]));
+      const [name, values] = [`B${index + 1}`, steps.map((step) => step.conditionValues[index])];
+      charts.push(this.lines(`Condition ${name}`, [name], [values]));
       if (cell === "affine") return;
       const units = readout.map((_, unit) => steps.map((step) => step.memory[index][unit]));
-      charts.push(this.lines(`Memory of B${index + 1}`, units.map((_, unit) => `h${unit + 1}`), units));
+      charts.push(this.lines(`Memory of ${name}`, units.map((_, unit) => `h${unit + 1}`), units));
     });
     if (action.kind !== "box") charts.push(scores);
     if (steps.some(({ reward }) => reward !== 0)) {
@@ -46,19 +48,25 @@ class ChartsView {
     let [low, high] = values.reduce(([least, most], value) => [Math.min(least, value), Math.max(most, value)], [0, 0]);
     if (high - low < 1e-9) [low, high] = [low - 1, high + 1];
     const y = (value) => 5 + (90 * (high - value)) / (high - low);
-    const paths = series.map((line, i) =>
-      draw("polyline", { points: line.map((value, t) => `${t} ${y(value).toFixed(2)}`).join(" "), class: `series s${i % 8}` })
-    );
+    const paths = series.map((line, i) => {
+      const points = line.map((value, t) => `${t} ${y(value).toFixed(2)}`);
+      return draw("polyline", { points: points.join(" "), class: `series s${i % 8}` });
+    });
     const rule = draw("line", { x1: 0, x2: this.length, y1: y(0), y2: y(0), class: "zero" });
-    const legend = names.length > 1 && names.length <= 16 ? names.map((name, i) => make("li", { class: `s${i % 8}` }, name)) : [];
-    return this.frame(title, [rule, ...paths], make("div", { class: "scale" }, make("span", {}, brief(high)), make("span", {}, brief(low))), legend);
+    const scale = make("div", { class: "scale" }, make("span", {}, brief(high)), make("span", {}, brief(low)));
+    const named = names.length > 1 && names.length <= 16 ? names : [];
+    const legend = named.map((name, i) => make("li", { class: `s${i % 8}` }, name));
+    return this.frame(title, [rule, ...paths], scale, legend);
   }
 
   // Which of some rows is on at each step.
   roll(title, rows, on) {
     const height = 100 / rows.length;
     const marks = on.flatMap((indices, t) =>
-      indices.map((row) => draw("rect", { x: t - 0.5, y: row * height + height * 0.15, width: 1, height: height * 0.7, class: "on" }))
+      indices.map((row) => {
+        const size = { width: 1, height: 0.7 * height };
+        return draw("rect", { x: t - 0.5, y: (row + 0.15) * height, ...size, class: "on" });
+      })
     );
     const labels = make("div", { class: "scale rows" }, rows.map((name) => make("span", {}, name)));
     const chart = this.frame(title, marks, labels, [], Math.min(12, Math.max(2.6, rows.length * 1.15)));
@@ -68,7 +76,8 @@ class ChartsView {
 
   frame(title, parts, scale, legend, height = 5.5) {
     const cursor = draw("line", { y1: 0, y2: 100, class: "cursor" });
-    const svg = draw("svg", { viewBox: `-0.5 0 ${this.length + 1} 100`, preserveAspectRatio: "none", "aria-hidden": "true", style: `height: ${height}rem` }, parts, cursor);
+    const view = { viewBox: `-0.5 0 ${this.length + 1} 100`, preserveAspectRatio: "none", "aria-hidden": "true" };
+    const svg = draw("svg", { ...view, style: `height: ${height}rem` }, parts, cursor);
     svg.addEventListener("click", (event) => {
       const box = svg.getBoundingClientRect();
       this.seek(Math.round(((event.clientX - box.left) / box.width) * (this.length + 1) - 0.5));

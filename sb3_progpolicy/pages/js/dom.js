@@ -54,7 +54,8 @@ const ICONS = {
 };
 
 function icon(name) {
-  return draw("svg", { viewBox: "0 0 20 20", class: `icon ${name}`, "aria-hidden": "true" }, draw("path", { d: ICONS[name] }));
+  const look = { viewBox: "0 0 20 20", class: `icon ${name}`, "aria-hidden": "true" };
+  return draw("svg", look, draw("path", { d: ICONS[name] }));
 }
 
 // What makes an element work as a button for keyboard and screen readers.

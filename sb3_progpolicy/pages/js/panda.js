@@ -20,7 +20,8 @@ function readScene({ scene, steps }) {
     const values = points.map((point) => point[axis]);
     return [Math.min(low, ...values) - 0.05, Math.max(high, ...values) + 0.05];
   };
-  return { frames, targets: scene.targets, x: reach(0, -0.1, 0.1), y: reach(1, -0.2, 0.2), z: [-0.04, reach(2, 0, 0.2)[1]] };
+  const [x, y, z] = [reach(0, -0.1, 0.1), reach(1, -0.2, 0.2), [-0.04, reach(2, 0, 0.2)[1]]];
+  return { frames, targets: scene.targets, x, y, z };
 }
 
 // Two views that share their horizontal axis, y: from above, and from the robot.

@@ -9,8 +9,9 @@ function formula(constant, weights, names, most) {
   terms.sort((a, b) => Math.abs(b.weight) - Math.abs(a.weight));
   const parts = constant !== 0 || terms.length === 0 ? [make("span", { class: "term" }, brief(constant))] : [];
   for (const { weight, name } of terms.slice(0, most)) {
-    const sign = weight < 0 ? MINUS : parts.length ? "+" : "";
-    const size = make("b", { class: weight < 0 ? "lowers" : "raises" }, `${sign}${parts.length ? "\u00a0" : ""}${brief(Math.abs(weight))}`);
+    const [sign, space] = [weight < 0 ? MINUS : parts.length ? "+" : "", parts.length ? "\u00a0" : ""];
+    const text = `${sign}${space}${brief(Math.abs(weight))}`;
+    const size = make("b", { class: weight < 0 ? "lowers" : "raises" }, text);
     parts.push(make("span", { class: "term" }, size, "\u00a0", pretty(name)));
   }
   const left = terms.length - most;
@@ -31,7 +32,8 @@ class ProgramView {
     this.branches = controllers.map((controller, index) =>
       make("li", { class: "branch" }, this.test(conditions, index), this.leaf(controller, index))
     );
-    const spine = make("ol", { class: conditions.length ? "spine" : "spine alone", "aria-label": "Program" }, this.branches);
+    const look = conditions.length ? "spine" : "spine alone";
+    const spine = make("ol", { class: look, "aria-label": "Program" }, this.branches);
     const hides = [...controllers.flatMap(({ weights }) => weights), ...conditions.map(({ readout }) => readout)].some(
       (row) => row.filter((weight) => weight !== 0).length > FEW_TERMS
     );
@@ -41,7 +43,8 @@ class ProgramView {
       if (this.frame) this.update(this.frame);
       this.container.querySelector("button").focus();
     };
-    const button = make("button", { type: "button", class: "quiet", onclick: toggle }, this.all ? "Show fewer terms" : "Show all terms");
+    const label = this.all ? "Show fewer terms" : "Show all terms";
+    const button = make("button", { type: "button", class: "quiet", onclick: toggle }, label);
     this.scroller = make("div", { class: "scroller" }, spine);
     this.container.replaceChildren(this.scroller, ...(hides ? [button] : []));
   }
@@ -67,7 +70,8 @@ class ProgramView {
 
   listens({ cell, readout }, index) {
     if (cell === "affine") return null;
-    const order = this.importance[index].map((size, i) => [size, this.program.inputNames[i]]).filter(([size]) => size > 0);
+    const sizes = this.importance[index].map((size, i) => [size, this.program.inputNames[i]]);
+    const order = sizes.filter(([size]) => size > 0);
     const names = order.sort((a, b) => b[0] - a[0]).slice(0, 3).map(([, name]) => pretty(name));
     const memory = `Memory of ${counted(readout.length, `${CELLS[cell]} unit`)}`;
     return make("p", { class: "sum" }, `${memory}; listens most to ${names.join(", ") || "nothing"}.`);

@@ -11,7 +11,8 @@ class ReasonsView {
   update(frame, ending) {
     Object.assign(this, { frame, ending });
     if (frame.final) {
-      this.container.replaceChildren(make("p", { class: frame.success ? "verdict-line reached" : "verdict-line" }, ending));
+      const look = frame.success ? "verdict-line reached" : "verdict-line";
+      this.container.replaceChildren(make("p", { class: look }, ending));
       return;
     }
     this.container.replaceChildren(this.sentence(), ...this.tests(), this.scores(), ...this.terms());
@@ -92,18 +93,23 @@ class ReasonsView {
     const thing = this.focus();
     if (typeof thing === "number") {
       const { weights, bias } = program.controllers[branch];
-      return { name: program.outputNames[thing], total: outputs[branch][thing], constant: bias[thing], weights: weights[thing], values: inputs, names: program.inputNames };
+      const sum = { total: outputs[branch][thing], constant: bias[thing], weights: weights[thing] };
+      return { ...sum, name: program.outputNames[thing], values: inputs, names: program.inputNames };
     }
     const index = Number(thing.slice(1)) - 1;
     const { cell, readout, readoutBias } = program.conditions[index];
-    const [values, names] = cell === "affine" ? [inputs, program.inputNames] : [memory[index], readout.map((_, unit) => `memory h${unit + 1}`)];
-    return { name: thing, total: conditionValues[index], constant: readoutBias, weights: readout, values, names };
+    const sum = { name: thing, total: conditionValues[index], constant: readoutBias, weights: readout };
+    if (cell === "affine") return { ...sum, values: inputs, names: program.inputNames };
+    return { ...sum, values: memory[index], names: readout.map((_, unit) => `memory h${unit + 1}`) };
   }
 
   // Every term of one sum, the largest first; together with the constant they are its value.
   terms() {
     const { name: subject, total, constant, weights, values, names } = this.sum();
-    const terms = weights.map((weight, j) => ({ value: weight * values[j], name: pretty(names[j]), product: `${brief(weight)} \u00d7 ${brief(values[j])}` }));
+    const terms = weights.map((weight, j) => {
+      const product = `${brief(weight)} \u00d7 ${brief(values[j])}`;
+      return { value: weight * values[j], name: pretty(names[j]), product };
+    });
     const silent = terms.filter(({ value }, j) => value === 0 && weights[j] !== 0).length;
     const heard = terms.filter(({ value }) => value !== 0);
     if (constant !== 0) heard.push({ value: constant, name: "constant", product: "" });
@@ -121,13 +127,24 @@ class ReasonsView {
       this.update(this.frame, this.ending);
       this.container.querySelector("button.quiet")?.focus();
     };
-    const many = heard.length > FEW_REASONS + 1;
-    return [
+    const quiet = { type: "button", class: "quiet", onclick: toggle };
+    const parts = [
       make("h3", {}, "What adds up to ", make("em", {}, pretty(subject))),
-      make("div", { class: "terms", role: "list", "aria-label": "Terms, the largest first" }, rows, this.row("sum", "", total, null, "total")),
-      many ? make("button", { type: "button", class: "quiet", onclick: toggle }, this.all ? "Show fewer terms" : `Show all ${heard.length} terms`) : null,
-      silent ? make("p", { class: "note" }, `${counted(silent, "more term")} ${silent === 1 ? "adds" : "add"} nothing now, since the input is 0.`) : null,
-    ].filter((part) => part !== null);
+      make(
+        "div",
+        { class: "terms", role: "list", "aria-label": "Terms, the largest first" },
+        rows,
+        this.row("sum", "", total, null, "total")
+      ),
+    ];
+    if (heard.length > FEW_REASONS + 1) {
+      parts.push(make("button", quiet, this.all ? "Show fewer terms" : `Show all ${heard.length} terms`));
+    }
+    if (silent) {
+      const more = `${counted(silent, "more term")} ${silent === 1 ? "adds" : "add"}`;
+      parts.push(make("p", { class: "note" }, `${more} nothing now, since the input is 0.`));
+    }
+    return parts;
   }
 
   row(name, product, value, widest, look = "") {
@@ -144,6 +161,7 @@ class ReasonsView {
 // A bar from the middle: to the right for what raises, to the left for what lowers.
 function bar(value, widest) {
   const share = (50 * Math.min(1, Math.abs(value) / widest)).toFixed(2);
-  const side = value < 0 ? `right: 50%` : `left: 50%`;
-  return make("span", { class: "bar", "aria-hidden": "true" }, make("i", { class: value < 0 ? "lowers" : "raises", style: `${side}; width: ${share}%` }));
+  const style = `${value < 0 ? "right" : "left"}: 50%; width: ${share}%`;
+  const fill = make("i", { class: value < 0 ? "lowers" : "raises", style });
+  return make("span", { class: "bar", "aria-hidden": "true" }, fill);
 }
