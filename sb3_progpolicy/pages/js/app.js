@@ -5,6 +5,7 @@ const PLACES = [
   "more-inputs",
 ];
 const KINDS = { trained: "training", validation: "validation, not trained on", unseen: "unseen in training" };
+const MOST_FIELDS = 200; // more would take the browser seconds
 const QUESTION =
   "Set the inputs: the program answers at once. A step forward keeps the answer and asks again; the program " +
   "remembers what it has read.";
@@ -162,8 +163,9 @@ class Page {
 
   makeQuestion() {
     this.player.hidden = true;
-    this.hint(QUESTION);
-    const names = this.program.inputNames.slice(0, this.program.nObservations);
+    const [total, shown] = [this.program.nObservations, Math.min(this.program.nObservations, MOST_FIELDS)];
+    this.hint(total > shown ? `${QUESTION} These are the first ${shown} of ${total}; the others stay 0.` : QUESTION);
+    const names = this.program.inputNames.slice(0, shown);
     this.question = new QuestionView(this.place.board, names, (index, value) => {
       const observations = this.observations.slice(0, this.t + 1);
       observations[this.t] = observations[this.t].map((old, i) => (i === index ? value : old));

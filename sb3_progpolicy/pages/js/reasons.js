@@ -162,6 +162,6 @@ class ReasonsView {
 function bar(value, widest) {
   const share = (50 * Math.min(1, Math.abs(value) / widest)).toFixed(2);
   const style = `${value < 0 ? "right" : "left"}: 50%; width: ${share}%`;
-  const fill = make("i", { class: value < 0 ? "lowers" : "raises", style });
-  return make("span", { class: "bar", "aria-hidden": "true" }, fill);
+  const inner = make("i", { class: value < 0 ? "lowers" : "raises", style });
+  return make("span", { class: "bar", "aria-hidden": "true" }, inner);
 }
