@@ -5,12 +5,15 @@ from __future__ import annotations
 import inspect
 from importlib.metadata import version as installed_version
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
 
 from progpolicy_envs import DOMAINS
+from sb3_progpolicy import load_pretrained, pretrained_names
+from sb3_progpolicy.pages import export_html
 
 project = "sb3-progpolicy"
 author = "the sb3-progpolicy developers"
@@ -99,6 +102,20 @@ def write_environment_pages(app: object) -> None:
             path.write_text(page, encoding="utf-8")
 
 
-def setup(app: object) -> None:
-    """Have the pages written before Sphinx looks for source files."""
-    app.connect("builder-inited", write_environment_pages)  # type: ignore[attr-defined]
+def write_program_pages(app: Any, error: Exception | None) -> None:
+    """Write a page for each shipped program next to the built documentation; the guide on programs has the links."""
+    if error is not None or app.builder.format != "html":
+        return
+    folder = Path(app.outdir) / "programs"
+    folder.mkdir(exist_ok=True)
+    for name in pretrained_names():
+        try:
+            export_html(load_pretrained(name), folder / f"{name}.html")
+        except ModuleNotFoundError as missing:  # PyBullet, of which there are no wheels for Python 3.12 and later
+            print(f"no page for {name}: {missing}")
+
+
+def setup(app: Any) -> None:
+    """Have the environments' pages written before Sphinx looks for source files, the programs' after it is done."""
+    app.connect("builder-inited", write_environment_pages)
+    app.connect("build-finished", write_program_pages)

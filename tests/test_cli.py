@@ -131,7 +131,15 @@ def test_run_model_and_program_are_the_same_source(trained, capsys):
 
 @pytest.mark.parametrize(
     ("format_", "start"),
-    [("text", "Program"), ("latex", "cases"), ("dot", "digraph"), ("python", '"""'), ("c", "hanoi_v0_act(")],
+    [
+        ("text", "Program"),
+        ("latex", "cases"),
+        ("dot", "digraph"),
+        ("python", '"""'),
+        ("c", "hanoi_v0_act("),
+        ("javascript", "class ProgramPolicy"),
+        ("html", "<!DOCTYPE html>"),
+    ],
 )
 def test_show_prints_every_format(format_, start, program, tmp_path, capsys):
     assert run(["show", program, "--format", format_]) == 0

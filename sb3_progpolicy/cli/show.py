@@ -16,10 +16,18 @@ from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.programs.files import write_atomically
 from sb3_progpolicy.programs.program import Program
 
-FORMATS = ("text", "latex", "dot", "python", "c", "png", "onnx")
+FORMATS = ("text", "latex", "dot", "python", "c", "javascript", "png", "html", "onnx")
 _OF_SUFFIX = {
-    ".txt": "text", ".tex": "latex", ".dot": "dot", ".py": "python", ".h": "c", ".png": "png", ".onnx": "onnx",
-}  # fmt: skip
+    ".txt": "text",
+    ".tex": "latex",
+    ".dot": "dot",
+    ".py": "python",
+    ".h": "c",
+    ".js": "javascript",
+    ".png": "png",
+    ".html": "html",
+    ".onnx": "onnx",
+}
 
 
 def show(
@@ -32,7 +40,7 @@ def show(
     ] = None,
     allow_pickle: Annotated[bool, typer.Option("--allow-pickle", help=ALLOW_PICKLE)] = False,
 ) -> None:
-    """Print a program as text, LaTeX, Graphviz, standalone Python or C, draw it, or write it as an ONNX model."""
+    """Print a program as text, LaTeX, Graphviz, Python, C or JavaScript, draw it, or write a web page or an ONNX model."""
     if format_ is None:
         format_ = _OF_SUFFIX.get(output.suffix.lower(), "text") if output is not None else "text"
     if format_ not in FORMATS:
@@ -43,7 +51,7 @@ def show(
         source = find_source(run_or_name, allow_pickle)
         if source.program is None:
             raise ValueError(f"{run_or_name} is not a program; ProgPolicy and PRLPolicy learn programs")
-        content = _printed(source.program, format_)
+        content = _printed(source.program, format_, source.env_kwargs)
     if output is None and isinstance(content, bytes):
         output = Path(_file_stem(source.program.metadata.get("env")) + f".{format_}")
     if output is None:
@@ -58,13 +66,15 @@ def _file_stem(env_id: str | None) -> str:
     return re.sub(r"[^A-Za-z0-9_.-]+", "-", (env_id or "").rpartition(":")[2])[:100] or "program"
 
 
-def _printed(program: Program, format_: str) -> str | bytes:
+def _printed(program: Program, format_: str, env_kwargs: dict[str, Any]) -> str | bytes:
     from sb3_progpolicy import programs
 
     if format_ == "png":
         return _drawn(program)
     if format_ == "onnx":
         return _model(program)
+    if format_ == "html":
+        return _page(program, env_kwargs)
     if format_ == "text":
         return programs.export_text(program)
     export: Any = {
@@ -72,8 +82,17 @@ def _printed(program: Program, format_: str) -> str | bytes:
         "dot": programs.export_graphviz,
         "python": programs.export_python,
         "c": programs.export_c,
+        "javascript": programs.export_javascript,
     }[format_]
     return export(program)
+
+
+def _page(program: Program, env_kwargs: dict[str, Any]) -> str:
+    from sb3_progpolicy.pages import export_html
+
+    page = export_html(program, env_kwargs=env_kwargs)
+    assert page is not None
+    return page
 
 
 def _drawn(program: Program) -> bytes:

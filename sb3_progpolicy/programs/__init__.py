@@ -1,9 +1,11 @@
 """Programs: the syntax as plain data, and everything that reads, runs, prints and saves it."""
 
 from sb3_progpolicy.programs import syntax as _syntax
+from sb3_progpolicy.programs.explain import ExplainedOutput, Explanation, explain
 from sb3_progpolicy.programs.export import (
     export_c,
     export_graphviz,
+    export_javascript,
     export_latex,
     export_onnx,
     export_python,
@@ -29,14 +31,18 @@ __all__ = [
     "ActionSpec",
     "Condition",
     "Controller",
+    "ExplainedOutput",
+    "Explanation",
     "Expression",
     "IfThenElse",
     "Program",
     "ProgramFormatError",
     "ProgramRunner",
     "check_program",
+    "explain",
     "export_c",
     "export_graphviz",
+    "export_javascript",
     "export_latex",
     "export_onnx",
     "export_python",

@@ -129,11 +129,22 @@ class ProgramRunner:
         for cell in self._cells:
             cell.reset()
         self._condition_values = np.zeros((self.n_envs, len(self._cells)))
+        self._outputs = np.zeros((self.n_envs, self._n_controllers, self.program.action.n_outputs))
 
     @property
     def condition_values(self) -> Floats:
         """The B of every condition at the last step, ``(n_envs, n_conditions)``; zeros before the first."""
         return self._condition_values
+
+    @property
+    def memory(self) -> tuple[Floats, ...]:
+        """The hidden units of every condition now, ``(n_envs, hidden_size)`` each; no columns for an affine one."""
+        return tuple(cell.h for cell in self._cells)
+
+    @property
+    def outputs(self) -> Floats:
+        """What every controller gave at the last step, ``(n_envs, n_controllers, n_outputs)``; zeros before it."""
+        return self._outputs
 
     @property
     def branch(self) -> NDArray[np.int64]:
@@ -176,8 +187,8 @@ class ProgramRunner:
         *gates, controllers = np.split(_accumulate(self._constant, self._columns, x), self._splits, axis=1)
         for index, (cell, gate) in enumerate(zip(self._cells, gates, strict=True)):
             self._condition_values[:, index] = cell.step(gate)
-        outputs = controllers.reshape(self.n_envs, self._n_controllers, -1)
-        return self._choose(outputs)
+        self._outputs = controllers.reshape(self.n_envs, self._n_controllers, -1)
+        return self._choose(self._outputs)
 
     def _choose(self, outputs: Floats) -> NDArray[Any]:
         action = self.program.action

@@ -13,6 +13,7 @@ import matplotlib.pyplot as plt
 from sb3_progpolicy.programs import (
     Program,
     export_graphviz,
+    export_javascript,
     export_latex,
     export_python,
     export_text,
@@ -51,6 +52,17 @@ def check_python(program: Program, expected: ast.Module | None = None) -> bytes:
                 if field == "id":
                     fixed.add(given)
     assert len({*variables.values(), *fixed}) == len(variables) + len(fixed)
+    return source
+
+
+def check_javascript(program: Program) -> str:
+    """Outside of its string literals the source is that of a plain program, and in a page it stays one script."""
+    source, plain = (export_javascript(p) for p in (program, with_plain_texts(program)))
+    literal = re.compile(r'"(?:[^"\\]|\\.)*"')
+    assert source.isascii()
+    assert literal.sub('""', source) == literal.sub('""', plain)
+    data = source.partition("const PROGRAM = ")[2].partition("\n};")[0]
+    assert not set("<>&") & set(data)
     return source
 
 

@@ -201,8 +201,10 @@ EXPORT_ALL = """
 import sys, matplotlib
 matplotlib.use("Agg")
 from sb3_progpolicy.programs import *
+from sb3_progpolicy.pages import export_html
 program = load_program(sys.argv[1])
-for export in (export_c, export_text, export_graphviz, export_latex, export_python, plot_program):
+exports = (export_c, export_text, export_graphviz, export_latex, export_python, export_javascript, export_html)
+for export in (*exports, plot_program):
     export(program)
 """
 

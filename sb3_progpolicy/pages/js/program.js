@@ -1,0 +1,140 @@
+// The program as a tree: conditions from top to bottom along a spine, and the controller that each leads to.
+
+const FEW_TERMS = 4;
+const CELLS = { rnn: "RNN", gru: "GRU", lstm: "LSTM" };
+
+// A sum as text, the largest terms first; what is zero is left out, and what comes after `most` only counted.
+function formula(constant, weights, names, most) {
+  const terms = weights.map((weight, index) => ({ weight, name: names[index] })).filter(({ weight }) => weight !== 0);
+  terms.sort((a, b) => Math.abs(b.weight) - Math.abs(a.weight));
+  const parts = constant !== 0 || terms.length === 0 ? [make("span", { class: "term" }, brief(constant))] : [];
+  for (const { weight, name } of terms.slice(0, most)) {
+    const [sign, space] = [weight < 0 ? MINUS : parts.length ? "+" : "", parts.length ? "\u00a0" : ""];
+    const text = `${sign}${space}${brief(Math.abs(weight))}`;
+    const size = make("b", { class: weight < 0 ? "lowers" : "raises" }, text);
+    parts.push(make("span", { class: "term" }, size, "\u00a0", pretty(name)));
+  }
+  const left = terms.length - most;
+  if (left > 0) parts.push(make("span", { class: "term rest" }, `+ ${counted(left, "more term")}`));
+  return parts.flatMap((part) => [part, " "]);
+}
+
+class ProgramView {
+  constructor(container, program, importance) {
+    Object.assign(this, { container, program, importance, all: false });
+    this.build();
+  }
+
+  build() {
+    const { conditions, controllers } = this.program;
+    this.values = [];
+    this.lines = [];
+    this.branches = controllers.map((controller, index) =>
+      make("li", { class: "branch" }, this.test(conditions, index), this.leaf(controller, index))
+    );
+    const look = conditions.length ? "spine" : "spine alone";
+    const spine = make("ol", { class: look, "aria-label": "Program" }, this.branches);
+    const hides = [...controllers.flatMap(({ weights }) => weights), ...conditions.map(({ readout }) => readout)].some(
+      (row) => row.filter((weight) => weight !== 0).length > FEW_TERMS
+    );
+    const toggle = () => {
+      this.all = !this.all;
+      this.build();
+      if (this.frame) this.update(this.frame);
+      this.container.querySelector("button").focus();
+    };
+    const label = this.all ? "Show fewer terms" : "Show all terms";
+    const button = make("button", { type: "button", class: "quiet", onclick: toggle }, label);
+    this.scroller = make("div", { class: "scroller" }, spine);
+    this.container.replaceChildren(this.scroller, ...(hides ? [button] : []));
+  }
+
+  test(conditions, index) {
+    if (conditions.length === 0) return make("p", { class: "test" }, make("code", {}, "always"));
+    if (index === conditions.length) return make("p", { class: "test" }, make("code", {}, "else"));
+    this.values[index] = make("output", { class: "verdict" });
+    const name = `B${index + 1}`;
+    return make(
+      "div",
+      { class: "test" },
+      make("p", {}, make("code", {}, `${index ? "else if" : "if"} ${name} \u2265 0`), this.values[index]),
+      make("p", { class: "sum" }, `${name} = `, this.condition(conditions[index])),
+      this.listens(conditions[index], index)
+    );
+  }
+
+  condition({ cell, readoutBias, readout }) {
+    const units = readout.map((_, unit) => `h${unit + 1}`);
+    return formula(readoutBias, readout, cell === "affine" ? this.program.inputNames : units, this.most());
+  }
+
+  listens({ cell, readout }, index) {
+    if (cell === "affine") return null;
+    const sizes = this.importance[index].map((size, i) => [size, this.program.inputNames[i]]);
+    const order = sizes.filter(([size]) => size > 0);
+    const names = order.sort((a, b) => b[0] - a[0]).slice(0, 3).map(([, name]) => pretty(name));
+    const memory = `Memory of ${counted(readout.length, `${CELLS[cell]} unit`)}`;
+    return make("p", { class: "sum" }, `${memory}; listens most to ${names.join(", ") || "nothing"}.`);
+  }
+
+  leaf({ weights, bias }, index) {
+    const { outputNames, inputNames } = this.program;
+    this.lines[index] = weights.map((row, i) =>
+      make(
+        "div",
+        { class: "line" },
+        make("dt", {}, pretty(outputNames[i])),
+        make("dd", {}, formula(bias[i], row, inputNames, this.most()))
+      )
+    );
+    return make("dl", { class: "leaf", "aria-label": `Controller ${index + 1}` }, this.lines[index]);
+  }
+
+  most() {
+    return this.all ? Infinity : FEW_TERMS;
+  }
+
+  // Light the branch that is taken and the outputs that are chosen.
+  update(frame) {
+    this.frame = frame;
+    this.branches.forEach((element, index) => {
+      element.classList.toggle("active", !frame.final && index === frame.branch);
+      element.classList.toggle("passed", !frame.final && index < frame.branch);
+      if (index === frame.branch) element.setAttribute("aria-current", "true");
+      else element.removeAttribute("aria-current");
+      const chosen = frame.final || index !== frame.branch ? [] : chosenOutputs(this.program.action, frame.action);
+      this.lines[index].forEach((line, i) => line.classList.toggle("chosen", chosen.includes(i)));
+    });
+    this.reveal(this.branches[frame.branch]);
+    this.values.forEach((output, index) => {
+      const value = frame.final ? null : frame.conditionValues[index];
+      output.textContent = value === null ? "" : `${brief(value)} ${value >= 0 ? "yes" : "no"}`;
+    });
+  }
+
+  // Scroll the tree, and never the page, to the active branch.
+  reveal(branch) {
+    if (!branch || this.scroller.scrollHeight <= this.scroller.clientHeight) return;
+    const [outer, inner] = [this.scroller.getBoundingClientRect(), branch.getBoundingClientRect()];
+    if (inner.top < outer.top || inner.bottom > outer.bottom) this.scroller.scrollTop += inner.top - outer.top - 8;
+  }
+}
+
+// Which outputs an action stands for; none of a Box, where every output is a number of the action.
+function chosenOutputs({ kind, sizes, start }, action) {
+  if (kind === "discrete") return [action - start];
+  if (kind === "multi_binary") return action.flatMap((on, i) => (on ? [i] : []));
+  if (kind === "box") return [];
+  let first = 0;
+  return sizes.map((size, part) => {
+    first += size;
+    return first - size + action[part];
+  });
+}
+
+// An action in words.
+function actionWords(program, action) {
+  if (program.action.kind === "box") return action.map((value) => show(value)).join(", ");
+  const names = chosenOutputs(program.action, action).map((index) => pretty(program.outputNames[index]));
+  return names.join(", ") || "all off";
+}
