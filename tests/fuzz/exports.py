@@ -9,7 +9,7 @@ import matplotlib
 import numpy as np
 
 from sb3_progpolicy.programs import ProgramRunner, join_inputs
-from tests.programs.formats import check_dot, check_latex, check_picture, check_python, check_text
+from tests.programs.formats import check_c, check_dot, check_latex, check_picture, check_python, check_text
 from tests.programs.hostile import with_hostile_texts
 from tests.programs.strategies import small_program
 
@@ -20,6 +20,7 @@ def case(rng: np.random.Generator, folder: Path) -> str:
     """Export a program; the Python file is then run, and acts as the program does."""
     program = with_hostile_texts(small_program(rng), rng)
     source = check_python(program)
+    check_c(program)
     check_text(program)
     check_dot(program)
     check_latex(program)
