@@ -14,6 +14,7 @@ matplotlib.use("Agg")
 import progpolicy_envs  # noqa: F401  registers Hanoi-v0
 from sb3_progpolicy.programs import (
     Program,
+    export_c,
     export_graphviz,
     export_latex,
     export_python,
@@ -47,12 +48,13 @@ out.mkdir(parents=True, exist_ok=True)
 program.save(out / "program.json")
 assert load_program(out / "program.json") == program
 
-# As text, as a picture, as Graphviz source, as LaTeX and as Python.
+# As text, as a picture, as Graphviz source, as LaTeX, as Python and as C; export_onnx writes a model for runtimes.
 print(export_text(program))
 plot_program(program).figure.savefig(out / "program.png", dpi=150, bbox_inches="tight")
 export_graphviz(program, out / "program.dot")  # dot -Tsvg program.dot
 (out / "program.tex").write_text(export_latex(program), encoding="utf-8")
 export_python(program, out / "hanoi_program.py")
+export_c(program, out / "hanoi_program.h")
 
 # The Python file stands alone: copy it anywhere. It keeps the state of the conditions itself; tell it what happened.
 policy = runpy.run_path(str(out / "hanoi_program.py"))["ProgramPolicy"]()

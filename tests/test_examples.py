@@ -35,7 +35,14 @@ def test_read_and_export_writes_every_format_of_a_program_trained_or_given(tmp_p
     output = run("read_and_export.py", tmp_path, "--out", "first")
     assert "files in first/" in output
     written = {path.name for path in (tmp_path / "first").iterdir()}
-    assert written == {"program.json", "program.png", "program.dot", "program.tex", "hanoi_program.py"}
+    assert written == {
+        "program.json",
+        "program.png",
+        "program.dot",
+        "program.tex",
+        "hanoi_program.h",
+        "hanoi_program.py",
+    }
     run("read_and_export.py", tmp_path, "first/program.json", "--out", "second")
     assert (tmp_path / "first/program.json").read_bytes() == (tmp_path / "second/program.json").read_bytes()
 

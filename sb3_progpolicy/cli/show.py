@@ -40,7 +40,7 @@ def show(
     ] = None,
     allow_pickle: Annotated[bool, typer.Option("--allow-pickle", help=ALLOW_PICKLE)] = False,
 ) -> None:
-    """Print a program as text, LaTeX, Graphviz, Python, C or JavaScript, draw it, or write a web page or an ONNX model."""
+    """Print a program as text, LaTeX, Graphviz, Python, C or JavaScript, draw it, or write a page or an ONNX model."""
     if format_ is None:
         format_ = _OF_SUFFIX.get(output.suffix.lower(), "text") if output is not None else "text"
     if format_ not in FORMATS:

@@ -9,7 +9,15 @@ import matplotlib
 import numpy as np
 
 from sb3_progpolicy.programs import ProgramRunner, join_inputs
-from tests.programs.formats import check_dot, check_javascript, check_latex, check_picture, check_python, check_text
+from tests.programs.formats import (
+    check_c,
+    check_dot,
+    check_javascript,
+    check_latex,
+    check_picture,
+    check_python,
+    check_text,
+)
 from tests.programs.hostile import with_hostile_texts
 from tests.programs.strategies import small_program
 
@@ -21,6 +29,7 @@ def case(rng: np.random.Generator, folder: Path) -> str:
     program = with_hostile_texts(small_program(rng), rng)
     source = check_python(program)
     check_javascript(program)
+    check_c(program)
     check_text(program)
     check_dot(program)
     check_latex(program)

@@ -12,6 +12,7 @@ import matplotlib.pyplot as plt
 
 from sb3_progpolicy.programs import (
     Program,
+    export_c,
     export_graphviz,
     export_javascript,
     export_latex,
@@ -64,6 +65,26 @@ def check_javascript(program: Program) -> str:
     data = source.partition("const PROGRAM = ")[2].partition("\n};")[0]
     assert not set("<>&") & set(data)
     return source
+
+
+def check_c(program: Program) -> None:
+    """The code, without comments and with the functions' prefix made plain, is that of a plain program."""
+    assert c_code(export_c(program)) == c_code(export_c(with_plain_texts(program)))
+
+
+def c_code(source: str) -> str:
+    """What a C compiler reads of an exported header."""
+    assert source.isascii()
+    assert "\\" not in source
+    assert "??" not in source
+    comments = re.findall(r"/\*.*?\*/", source, flags=re.DOTALL)
+    assert not any("/*" in comment[2:] for comment in comments)
+    bare = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
+    match = re.search(r"(\w+)_state;", bare)
+    assert match
+    assert re.fullmatch(r"[a-z][a-z0-9_]{0,47}", match[1])
+    bare = re.sub(rf"\b{match[1]}_(state|reset|act)\b", r"plain_\1", bare)
+    return bare.replace(f"{match[1].upper()}_PROGRAM_H", "PLAIN_PROGRAM_H")
 
 
 def check_text(program: Program) -> None:

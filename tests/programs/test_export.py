@@ -175,6 +175,13 @@ def test_python_of_a_program_with_few_terms_is_what_a_person_would_have_written(
     )
 
 
+def test_minus_in_the_name_of_an_input_is_part_of_its_variable():
+    program = replace(program_by_hand(), input_names=("view[-1]", "view[1]", "0->1", *"abcdef"))
+    source = export_python(program)
+    assert "view_minus_1 = float(observation[0])" in source
+    assert "view_1 = float(observation[1])" in source
+
+
 def test_exported_sum_of_thousands_of_terms_still_compiles():
     n = 5000
     program = build_program(0, ["affine", "gru"], "box", False, n_observations=n, hidden_size=1)

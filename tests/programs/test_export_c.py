@@ -11,6 +11,7 @@ import pytest
 
 from sb3_progpolicy import load_pretrained, pretrained_names
 from sb3_progpolicy.programs import ActionSpec, Controller, ProgramRunner, export_c, join_inputs
+from tests.programs.formats import c_code, check_c
 from tests.programs.hostile import TITLES, with_hostile_texts, with_plain_texts
 from tests.programs.strategies import CELLS, KINDS, build_program, random_actions, small_program
 from tests.programs.test_hostile import LARGEST, with_all_pieces
@@ -176,6 +177,13 @@ def test_first_of_equal_scores_is_taken_and_no_weight_of_zero_is_written(tmp_pat
 
 
 @needs_compiler
+def test_condition_that_is_exactly_zero_holds(tmp_path):
+    program = build_program(1, ["affine", "affine"], "discrete", False)
+    condition = replace(program.conditions[0], readout=(0.0,) * 5, readout_bias=0.0)
+    assert check_actions(replace(program, body=replace(program.body, condition=condition)), tmp_path, 50) == {0}
+
+
+@needs_compiler
 @pytest.mark.filterwarnings("ignore:overflow encountered in add")
 def test_infinite_sum_of_two_constants_compiles(tmp_path):
     program = build_program(0, ["rnn"], "discrete", False, hidden_size=1)
@@ -187,34 +195,19 @@ def test_infinite_sum_of_two_constants_compiles(tmp_path):
 # Texts
 
 
-def code(source):
-    """What a compiler reads: without comments, and with the prefix made plain."""
-    assert source.isascii()
-    assert "\\" not in source
-    assert "??" not in source
-    comments = re.findall(r"/\*.*?\*/", source, flags=re.DOTALL)
-    assert not any("/*" in comment[2:] for comment in comments)
-    bare = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
-    prefix = re.search(r"(\w+)_state;", bare)[1]
-    assert re.fullmatch(r"[a-z][a-z0-9_]{0,47}", prefix)
-    bare = re.sub(rf"\b{prefix}_(state|reset|act)\b", r"plain_\1", bare)
-    return bare.replace(f"{prefix.upper()}_PROGRAM_H", "PLAIN_PROGRAM_H")
-
-
 def test_no_text_of_a_program_becomes_code():
     rng = np.random.default_rng(0)
     for _ in range(100):
         program = small_program(rng)
-        expected = code(export_c(with_plain_texts(program)))
         for _ in range(10):
-            assert code(export_c(with_hostile_texts(program, rng))) == expected
+            check_c(with_hostile_texts(program, rng))
 
 
 @pytest.mark.parametrize("title", [*TITLES, "*/ int main(void) { return 1; } /*", "int", "9", "??/", "my_envs:Pong-v5"])
 def test_functions_have_the_name_of_the_environment_as_far_as_c_can_have_it(title):
     program = replace(build_program(0, [], "box", False), metadata={"env": title})
-    expected = code(export_c(with_plain_texts(program)))
-    assert code(export_c(program)) == expected
+    expected = c_code(export_c(with_plain_texts(program)))
+    assert c_code(export_c(program)) == expected
     if title == "my_envs:Pong-v5":
         assert "static inline void pong_v5_reset(pong_v5_state *state)" in export_c(program)
 

@@ -43,7 +43,7 @@ def test_what_the_function_means_is_said_below_it_and_only_there():
 
 def test_other_weights_are_printed_one_by_one():
     assert "table*(" not in export_text(program([[1, 2, 3], [1, 2, 4]]))
-    assert "4*[table[1,2]]" in line(program([[1, 2, 3], [1, 2, 4]]))
+    assert "4*table[1,2]" in line(program([[1, 2, 3], [1, 2, 4]]))
     assert "table*(" not in export_text(program([[0.5, 0.5, 0.5], [0.5, 0.5, 0.5]]))
 
 

@@ -28,6 +28,7 @@ class Identifiers:
 
     def new(self, text: str) -> str:
         """Return a name that has not been used."""
+        text = re.sub(r"(?<![0-9a-zA-Z])-(?=[0-9])", "_minus_", text)  # rank[-1] is not rank[1]
         name = re.sub(r"[^0-9a-zA-Z]+", "_", text).strip("_").lower()[:_MAX_IDENTIFIER]
         if not name or name[0].isdigit() or name in _TAKEN or _OURS.fullmatch(name):
             name = f"x_{name}".rstrip("_")
