@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import io
 import re
+import textwrap
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from gymnasium.envs.registration import load_env_creator
 
 from sb3_progpolicy.cli.parsing import ALLOW_PICKLE, check_folder
 from sb3_progpolicy.cli.streams import quiet_stdout
@@ -15,8 +17,10 @@ from sb3_progpolicy.experiment.sources import find_source
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.programs.files import write_atomically
 from sb3_progpolicy.programs.program import Program
+from sb3_progpolicy.programs.syntax import inputs_read
 
 FORMATS = ("text", "latex", "dot", "python", "c", "javascript", "png", "html", "onnx")
+FOR_READING = ("text", "latex", "dot", "png", "html")
 _OF_SUFFIX = {
     ".txt": "text",
     ".tex": "latex",
@@ -38,9 +42,14 @@ def show(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="file to write; png, onnx: <environment>.png by default")
     ] = None,
+    full: Annotated[bool, typer.Option("--full", help="as it was learnt, not simplified")] = False,
     allow_pickle: Annotated[bool, typer.Option("--allow-pickle", help=ALLOW_PICKLE)] = False,
 ) -> None:
-    """Print a program as text, LaTeX, Graphviz, Python, C or JavaScript, draw it, or write a page or an ONNX model."""
+    """Print a program as text, LaTeX, Graphviz, Python, C or JavaScript, draw it, or write a page or an ONNX model.
+
+    What is for reading (text, latex, dot, png, html) is simplified first where that is proven to change no decision
+    from any start of training. What is for running has the numbers as they were learnt.
+    """
     if format_ is None:
         format_ = _OF_SUFFIX.get(output.suffix.lower(), "text") if output is not None else "text"
     if format_ not in FORMATS:
@@ -51,7 +60,10 @@ def show(
         source = find_source(run_or_name, allow_pickle)
         if source.program is None:
             raise ValueError(f"{run_or_name} is not a program; ProgPolicy and PRLPolicy learn programs")
-        content = _printed(source.program, format_, source.env_kwargs)
+        program = source.program
+        if format_ in FOR_READING and not full and not source.env_kwargs:
+            program = _simplified(program, source.env_id)
+        content = _text(program, full) if format_ == "text" else _printed(program, format_, source.env_kwargs)
     if output is None and isinstance(content, bytes):
         output = Path(_file_stem(source.program.metadata.get("env")) + f".{format_}")
     if output is None:
@@ -75,8 +87,6 @@ def _printed(program: Program, format_: str, env_kwargs: dict[str, Any]) -> str 
         return _model(program)
     if format_ == "html":
         return _page(program, env_kwargs)
-    if format_ == "text":
-        return programs.export_text(program)
     export: Any = {
         "latex": programs.export_latex,
         "dot": programs.export_graphviz,
@@ -85,6 +95,53 @@ def _printed(program: Program, format_: str, env_kwargs: dict[str, Any]) -> str 
         "javascript": programs.export_javascript,
     }[format_]
     return export(program)
+
+
+def _simplified(program: Program, env_id: str | None) -> Program:
+    """Return the smallest program that is proven to make the same decisions from all starts of training, if known."""
+    from sb3_progpolicy.analysis.lossless import lossless
+
+    found = lossless(program, env_id)
+    if found is None:
+        return program
+    typer.echo(
+        f"Simplified from {found.terms_before} numbers, with the same decisions in all {found.situations} situations "
+        "of training. --full shows it as it was learnt.",
+        err=True,
+    )
+    return found.program
+
+
+def _text(program: Program, full: bool) -> str:
+    """The program, all of it where it is small or asked for, and what its inputs are."""
+    from sb3_progpolicy.evaluation import id_from_file
+    from sb3_progpolicy.programs import export_text
+
+    whole = full or "simplified" in program.metadata
+    text = export_text(program, max_terms=None if whole else 6)
+    lines = _glossary(program, id_from_file(program.metadata.get("env")))
+    return text + ("\n" + "\n".join(lines) + "\n" if lines else "")
+
+
+def _glossary(program: Program, env_id: str | None) -> list[str]:
+    """Say what the inputs mean that the program reads."""
+    import gymnasium as gym
+
+    from progpolicy_envs.documentation import observation_rows
+
+    if env_id is None or env_id.rpartition(":")[2] not in gym.registry:
+        return []
+    creator = gym.spec(env_id.rpartition(":")[2]).entry_point
+    docstring = (load_env_creator(creator) if isinstance(creator, str) else creator).__doc__
+    rows = [row for row in observation_rows(docstring) if set(row.numbers) & inputs_read(program)]
+    width = max((len(row.name) for row in rows), default=0)
+    return [
+        line
+        for row in rows
+        for line in textwrap.wrap(
+            f"{row.name.ljust(width)}  {row.meaning}", 100, subsequent_indent=" " * (width + 2), break_long_words=False
+        )
+    ]
 
 
 def _page(program: Program, env_kwargs: dict[str, Any]) -> str:

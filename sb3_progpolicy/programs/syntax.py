@@ -112,3 +112,11 @@ class ProgramData:
         while isinstance(expression, IfThenElse):
             yield expression
             expression = expression.orelse
+
+
+def inputs_read(program: ProgramData) -> set[int]:
+    """Return the indices of the inputs that a program reads: those with a weight that is not zero."""
+    rows = [row for controller in program.controllers for row in controller.weights]
+    for condition in program.conditions:
+        rows += [condition.readout] if condition.cell == "affine" else condition.weight_ih
+    return {index for row in rows for index, weight in enumerate(row) if weight}

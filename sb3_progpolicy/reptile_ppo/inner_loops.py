@@ -104,12 +104,12 @@ class _Replica:
     """
 
     def __init__(self, saved: bytes) -> None:
-        from sb3_progpolicy.reptile_ppo.algorithm import ReptilePPO
-
         th.set_num_threads(1)
-        env, device, model = cloudpickle.loads(saved)
+        algorithm, env, device, model = cloudpickle.loads(saved)
         with simulations_in_this_process():
-            self.model = ReptilePPO.load(io.BytesIO(model), env=env, device=device, allow_pickle=True, verbose=0)
+            self.model: ReptilePPO = algorithm.load(
+                io.BytesIO(model), env=env, device=device, allow_pickle=True, verbose=0
+            )
 
     def run(self, job: bytes) -> bytes:
         """Make an inner loop.
@@ -138,7 +138,7 @@ def _saved(model: ReptilePPO) -> bytes:
     """Return what a :class:`_Replica` is made of."""
     stream = io.BytesIO()
     model.save(stream, allow_pickle=True)
-    return cloudpickle.dumps((model.env_id, str(model.device), stream.getvalue()))
+    return cloudpickle.dumps((type(model), model.env_id, str(model.device), stream.getvalue()))
 
 
 class _RemoteLoops(InnerLoops):

@@ -14,6 +14,7 @@ from sb3_progpolicy.programs.export.visitor import (
     gate_names,
     largest_terms,
     pack,
+    simplified_as,
     title,
 )
 from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, ProgramData
@@ -80,6 +81,7 @@ class _TextPrinter(ProgramVisitor[list[str]]):
             reads += f", {program.action.history_size} for the previous action, its reward and the done flag"
         return [
             f"{title(program)}: {counted(n_conditions, 'condition')}, {counted(n_conditions + 1, 'controller')}.",
+            *simplified_as(program),
             f"{reads}.",
             action_rule(program.action),
             *(

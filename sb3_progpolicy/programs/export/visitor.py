@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -146,6 +146,20 @@ def title(program: ProgramData) -> str:
     environment = program.metadata.get("env")
     known = isinstance(environment, str) and environment.isprintable() and 0 < len(environment) <= 100
     return f"Program for {environment}" if known else "Program"
+
+
+def simplified_as(program: ProgramData) -> list[str]:
+    """What a simplified program's metadata says of it, in a sentence; nothing of any other program."""
+    said = program.metadata.get("simplified")
+    terms = said.get("terms") if isinstance(said, Mapping) else None
+    if type(terms) is not int or not 0 < terms < 10**6:
+        return []
+    assert isinstance(said, Mapping)
+    name, bound = said.get("symmetry"), said.get("terms_lower_bound")
+    tied = isinstance(name, str) and name.isidentifier() and len(name) <= 40
+    sentence = f"Simplified to {counted(terms, 'term')}"
+    sentence += f", tied over a symmetry ({name})" if tied else ""
+    return [sentence + ("; no program of this form has fewer." if bound == terms else ".")]
 
 
 def counted(number: int, noun: str) -> str:
