@@ -1,11 +1,14 @@
-"""Learn the Tower of Hanoi with 1-4 discs from scratch and solve 8: what ``make demo`` runs.
+"""Learn the Tower of Hanoi with 1-4 discs from scratch, solve 12, and say why: what ``make demo`` runs.
 
-Settings: sb3_progpolicy/hyperparams/reptile_ppo.yml. The program, a drawing of it and a film go to ``runs/demo``.
+Settings: sb3_progpolicy/hyperparams/reptile_ppo.yml. The program as it was learnt is simplified to the fewest whole
+numbers that make the same decisions on 1-4 discs, and run from all pegs to all pegs with up to 12. Both programs, a
+drawing, a page to step through, the certificate and a film go to ``runs/demo``.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from pathlib import Path
 
@@ -20,13 +23,17 @@ from rich.console import Console
 from rich.table import Table
 
 from sb3_progpolicy import ReptilePPO, evaluate_program
+from sb3_progpolicy.analysis.simplify import simplify
+from sb3_progpolicy.analysis.verify import Verification, certificate, verify
 from sb3_progpolicy.experiment.config import make_config
 from sb3_progpolicy.experiment.run import build_model
+from sb3_progpolicy.pages import export_html
 from sb3_progpolicy.programs import Program, ProgramRunner, export_text, join_inputs, plot_program
 
 ENV = "Hanoi-v0"
 TRAINED_ON = 4
 SIZES = range(1, 9)
+CERTIFIED = range(1, 13)
 
 
 def learn_program(timesteps: int | None, seed: int) -> Program:
@@ -53,6 +60,18 @@ def results_table(program: Program) -> Table:
             cells += [f"{result.steps_mean:.0f}", f"{result.steps_mean / optimum:.2f}"] if solved else ["failed", ""]
         unseen = n_discs > TRAINED_ON
         table.add_row(str(n_discs), str(optimum), *cells, style="bold" if unseen else None)
+    return table
+
+
+def certificate_table(rows: list[Verification]) -> Table:
+    """Show from how many pairs of pegs the goal is reached, and from how many in the fewest steps."""
+    table = Table(title="The simplified program, from every peg to every other")
+    for column in ("discs", "starts", "solved", "optimal"):
+        table.add_column(column, justify="right")
+    for row in rows:
+        unseen = row.variation["n_discs"] > TRAINED_ON
+        cells = (row.variation["n_discs"], row.starts, row.solved, row.optimal)
+        table.add_row(*map(str, cells), style="bold" if unseen else None)
     return table
 
 
@@ -90,12 +109,26 @@ def main() -> None:
     console.print(export_text(program), markup=False, highlight=False, soft_wrap=True)
     console.print(results_table(program))
 
+    found = simplify(program)
+    small = found.program
+    console.print(f"{found.terms_before} numbers, of which {found.terms_after} terms make the same decisions:\n")
+    console.print(export_text(small, max_terms=None), markup=False, highlight=False, soft_wrap=True)
+    rows = verify(small, ENV, [{"n_discs": n_discs} for n_discs in CERTIFIED])
+    console.print(certificate_table(rows))
+
     arguments.out.mkdir(parents=True, exist_ok=True)
     program.save(arguments.out / "program.json")
-    plot_program(program).figure.savefig(arguments.out / "program.png", dpi=150, bbox_inches="tight")
+    small.save(arguments.out / "simplified.json")
+    written = certificate(small, ENV, rows, "python examples/demo.py")
+    (arguments.out / "certificate.json").write_text(json.dumps(written, indent=1) + "\n", encoding="utf-8")
+    export_html(small, arguments.out / "hanoi.html")
+    plot_program(small).figure.savefig(arguments.out / "program.png", dpi=150, bbox_inches="tight")
     plt.close("all")
     save_film(program, arguments.out / "hanoi.gif", n_discs=TRAINED_ON + 1)
-    console.print(f"Trained in {seconds:.0f} s. Written to {arguments.out}/: program.json, program.png, hanoi.gif")
+    console.print(
+        f"Trained in {seconds:.0f} s. Written to {arguments.out}/: program.json, simplified.json, certificate.json, "
+        f"program.png, hanoi.gif. A page to step through: {arguments.out / 'hanoi.html'}"
+    )
 
 
 if __name__ == "__main__":

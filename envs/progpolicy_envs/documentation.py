@@ -55,7 +55,7 @@ def observation_rows(docstring: str | None) -> list[Row]:
         for line in (section[1].splitlines() if section else ())
         if line.strip().startswith("|")
     ]
-    if not cells or not {"Num", "Meaning"} <= set(cells[0]) or set(cells[1][0]) != {"-"}:
+    if len(cells) < 2 or not {"Num", "Meaning"} <= set(cells[0]) or set(cells[1][0]) != {"-"}:
         return []
     number, meaning = (cells[0].index(name) for name in ("Num", "Meaning"))
     rows: list[list[str]] = []

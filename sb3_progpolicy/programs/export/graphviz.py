@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from typing import Any
 
+from sb3_progpolicy.programs.export.grids import blocks_of, collapse, terms_to_show
 from sb3_progpolicy.programs.export.visitor import (
     CELL_NAMES,
     Decimals,
@@ -22,7 +24,7 @@ def export_graphviz(
     program: ProgramData,
     out_file: str | os.PathLike[str] | Any | None = None,
     decimals: int = 2,
-    max_terms: int | None = 3,
+    max_terms: int | None = None,
 ) -> str | None:
     """Draw a program in the DOT language.
 
@@ -32,7 +34,7 @@ def export_graphviz(
     :param program: what to draw
     :param out_file: a path or an open text file to write to
     :param decimals: digits after the point
-    :param max_terms: terms shown of each sum; ``None`` for all
+    :param max_terms: terms shown of each sum; by default all where no sum has more than six, else three
     :return: the DOT source if ``out_file`` is ``None``, else ``None``
     :raises ValueError: if the program is not well formed
     """
@@ -51,7 +53,8 @@ def export_graphviz(
 class _DotPrinter(ProgramVisitor[list[str]]):
     def __init__(self, program: ProgramData, decimals: int, max_terms: int | None) -> None:
         super().__init__(program)
-        self.number, self.max_terms = Decimals(program, decimals), max_terms
+        self.number = Decimals(program, decimals)
+        self.max_terms, self.blocks = terms_to_show(program, max_terms), blocks_of(program)
 
     def visit_branch(self, branch: IfThenElse, index: int) -> list[str]:
         following = f"B{index + 2}" if isinstance(branch.orelse, IfThenElse) else f"C{index + 2}"
@@ -65,7 +68,7 @@ class _DotPrinter(ProgramVisitor[list[str]]):
 
     def visit_controller(self, controller: Controller, index: int) -> list[str]:
         lines = [
-            f"{name} = {self._sum(constant, weights, self.program.input_names)}"
+            f"{name} = {self._sum(constant, *collapse(self.blocks, weights, self.program.input_names))}"
             for name, constant, weights in zip(
                 self.program.output_names, controller.bias, controller.weights, strict=True
             )
@@ -77,7 +80,7 @@ class _DotPrinter(ProgramVisitor[list[str]]):
         if condition.cell == "affine":
             return [
                 f"B{index + 1} >= 0 ?",
-                self._sum(condition.readout_bias, condition.readout, self.program.input_names),
+                self._sum(condition.readout_bias, *collapse(self.blocks, condition.readout, self.program.input_names)),
             ]
         units = [f"h{unit + 1}" for unit in range(condition.hidden_size)]
         heard = largest_terms(input_importance(condition), self.program.input_names, 9, self.max_terms)
@@ -88,7 +91,7 @@ class _DotPrinter(ProgramVisitor[list[str]]):
             f"listens most to {', '.join(name for _, name in heard.shown) or 'nothing'}",
         ]
 
-    def _sum(self, constant: float, weights: tuple[float, ...], names: Any) -> str:
+    def _sum(self, constant: float, weights: Sequence[float], names: Sequence[str]) -> str:
         terms = largest_terms(weights, names, self.number.digits, self.max_terms)
         tokens = [
             self.number(constant),

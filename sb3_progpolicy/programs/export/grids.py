@@ -11,6 +11,8 @@ import numpy as np
 from sb3_progpolicy.programs.syntax import ProgramData
 
 #: Said where a function of row and column is printed.
+#: A picture shows sums of up to so many terms in full, and of larger ones so many.
+FEW_TERMS, MOST_TERMS = 6, 3
 LEGEND = "{name}*(...) is summed over all cells {name}[row,column]; rows and columns count from 0."
 
 
@@ -83,3 +85,34 @@ def function_text(block: Block, function: tuple[float, float, float]) -> str:
             words = f"{size}*{name}" if name and size != 1 else name or str(size)
             parts.append((" - " if number < 0 else " + ") + words if parts else ("-" if number < 0 else "") + words)
     return f"{block.name}*({''.join(parts)})"
+
+
+def collapse(blocks: Sequence[Block], weights: Sequence[float], names: Sequence[str]) -> tuple[list[float], list[str]]:
+    """Return weights and names in which a grid that is a function of row and column is one term, of weight 1.
+
+    :param blocks: of the program
+    :param weights: of all inputs
+    :param names: of all inputs
+    """
+    left, named = list(weights), list(names)
+    for block in reversed(blocks):
+        function = as_function(block, weights)
+        if function is not None and any(function):
+            left[block.start : block.stop] = [1.0]
+            named[block.start : block.stop] = [function_text(block, function)]
+    return left, named
+
+
+def terms_to_show(program: ProgramData, max_terms: int | None) -> int | None:
+    """Return how many terms of each sum a small picture shows: all where there are few, else three.
+
+    :param program: that is drawn
+    :param max_terms: as given; ``None`` to choose
+    """
+    if max_terms is not None:
+        return max_terms
+    blocks = blocks_of(program)
+    rows = [row for controller in program.controllers for row in controller.weights]
+    rows += [condition.readout for condition in program.conditions if condition.cell == "affine"]
+    counts = [sum(map(bool, collapse(blocks, row, program.input_names)[0])) for row in rows]
+    return None if max(counts, default=0) <= FEW_TERMS else MOST_TERMS

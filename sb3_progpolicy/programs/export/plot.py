@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from sb3_progpolicy.programs.export.grids import blocks_of, collapse, terms_to_show
 from sb3_progpolicy.programs.export.visitor import (
     CELL_NAMES,
     Decimals,
@@ -43,7 +44,7 @@ class _Card:
 
 
 def plot_program(
-    program: ProgramData, ax: Any = None, decimals: int = 1, max_terms: int = 3, max_outputs: int = MAX_ROWS
+    program: ProgramData, ax: Any = None, decimals: int = 1, max_terms: int | None = None, max_outputs: int = MAX_ROWS
 ) -> Any:
     """Draw a program: conditions on the left from top to bottom, the controller that each leads to on the right.
 
@@ -54,7 +55,8 @@ def plot_program(
     :param program: what to draw
     :param ax: matplotlib axes to draw into; by default a new figure of the size that the program needs
     :param decimals: digits after the point
-    :param max_terms: terms shown of each sum, the constant not counted
+    :param max_terms: terms shown of each sum, the constant not counted; by default all where no sum has more than six,
+        else three
     :param max_outputs: outputs shown of each controller
     :return: the axes
     :raises ValueError: if the program is not well formed
@@ -68,7 +70,7 @@ def plot_program(
     pairs = cards.visit(program.body)
     left = max((condition.width for condition, _ in pairs if condition), default=0.0)
     arrow = 0.75 if left else 0.0
-    reading = _how_to_read(program)
+    reading = _how_to_read(program, cards.max_terms is None)
     texts = max(CHARACTER * len(line) for line in reading)
     right = max(leaf.width for _, leaf in pairs)
     width = max(left + arrow + right, texts) + 2 * GAP
@@ -98,7 +100,7 @@ def plot_program(
     return ax
 
 
-def _how_to_read(program: ProgramData) -> tuple[str, ...]:
+def _how_to_read(program: ProgramData, whole: bool) -> tuple[str, ...]:
     """Two lines for a reader who has never seen a program."""
     what = {
         "discrete": "The score of each action: the highest wins.",
@@ -109,16 +111,18 @@ def _how_to_read(program: ProgramData) -> tuple[str, ...]:
     order = "Read from top to bottom: the first condition that holds decides. " if program.conditions else ""
     return (
         f"{order}{what}",
-        "Constant first, then the largest terms: green raises the value, red lowers it, … counts the smaller terms.",
+        "Constant first, then the terms, the largest before the others: green raises the value, red lowers it"
+        + ("." if whole else ", … counts those left out."),
     )
 
 
 class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
     """Turns every step of the program into a condition card (none for the last) and a controller card."""
 
-    def __init__(self, program: ProgramData, decimals: int, max_terms: int, max_outputs: int) -> None:
+    def __init__(self, program: ProgramData, decimals: int, max_terms: int | None, max_outputs: int) -> None:
         super().__init__(program)
-        self.number, self.max_terms, self.max_outputs = Decimals(program, decimals), max_terms, max_outputs
+        self.number, self.max_outputs = Decimals(program, decimals), max_outputs
+        self.max_terms, self.blocks = terms_to_show(program, max_terms), blocks_of(program)
 
     def visit_branch(self, branch: IfThenElse, index: int) -> list[tuple[_Card | None, _Card]]:
         pair = (self._condition(branch.condition, index), self._leaf(branch.then))
@@ -130,7 +134,8 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
     def _condition(self, condition: Condition, index: int) -> _Card:
         inputs = self.program.input_names
         if condition.cell == "affine":
-            constant, terms = self._terms(condition.readout_bias, condition.readout, inputs)
+            readout, names = collapse(self.blocks, condition.readout, inputs)
+            constant, terms = self._terms(condition.readout_bias, readout, names)
             lines = ["no memory"]
         else:
             units = [f"h{unit + 1}" for unit in range(condition.hidden_size)]
@@ -149,7 +154,8 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
         names = [_label(name) for name in self.program.output_names]
         shown = min(len(names), self.max_outputs)
         sums = [
-            self._terms(controller.bias[row], controller.weights[row], self.program.input_names) for row in range(shown)
+            self._terms(controller.bias[row], *collapse(self.blocks, controller.weights[row], self.program.input_names))
+            for row in range(shown)
         ]
         columns = [max(len(name) for name in names[:shown]) + 2]
         columns.append(columns[0] + max(len(constant) for constant, _ in sums) + 2)
