@@ -22,9 +22,8 @@ from PIL import Image
 from rich.console import Console
 from rich.table import Table
 
-from sb3_progpolicy import ReptilePPO, evaluate_program
-from sb3_progpolicy.analysis.simplify import simplify
-from sb3_progpolicy.analysis.verify import Verification, certificate, verify
+from sb3_progpolicy import ReptilePPO, Verification, evaluate_program, simplify, verify
+from sb3_progpolicy.analysis.verify import certificate
 from sb3_progpolicy.experiment.config import make_config
 from sb3_progpolicy.experiment.run import build_model
 from sb3_progpolicy.pages import export_html

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 import progpolicy_envs  # registers the environments
 
 if TYPE_CHECKING:
+    from sb3_progpolicy.analysis.simplify import Simplification, simplify
+    from sb3_progpolicy.analysis.verify import Verification, verify
     from sb3_progpolicy.baselines import HIRO, DiscreteSAC
     from sb3_progpolicy.callbacks import InteractionEvalCallback
     from sb3_progpolicy.evaluation import Evaluation, evaluate_model, evaluate_program
@@ -35,8 +37,10 @@ _MODULES = {
     "ReptileCheckpoint": "reptile",
     "ReptilePPO": "reptile_ppo",
     "ReptileWrapper": "reptile",
+    "Simplification": "analysis.simplify",
     "TaskDistribution": "reptile",
     "VecInteractionHistory": "interaction",
+    "Verification": "analysis.verify",
     "evaluate_model": "evaluation",
     "evaluate_program": "evaluation",
     "extract_program": "extraction",
@@ -45,6 +49,8 @@ _MODULES = {
     "load_pretrained": "pretrained",
     "make_fast_vec_env": "vec_env",
     "pretrained_names": "pretrained",
+    "simplify": "analysis.simplify",
+    "verify": "analysis.verify",
 }
 
 __all__ = [
@@ -62,8 +68,10 @@ __all__ = [
     "ReptileCheckpoint",
     "ReptilePPO",
     "ReptileWrapper",
+    "Simplification",
     "TaskDistribution",
     "VecInteractionHistory",
+    "Verification",
     "evaluate_model",
     "evaluate_program",
     "extract_program",
@@ -73,6 +81,8 @@ __all__ = [
     "make_fast_vec_env",
     "pretrained_names",
     "progpolicy_envs",
+    "simplify",
+    "verify",
 ]
 
 

@@ -169,21 +169,20 @@ def simplify(
     else:
         notes.append(f"in {int(wrong.sum())} of {len(met.inputs)} situations it decides otherwise")
     notes = [*rules.notes, *notes]
-    metadata = {
-        **program.metadata,
-        "simplified": {
+    metadata = dict(program.metadata)
+    if small.body != program.body:
+        metadata["simplified"] = {
             "from": program_digest(program),
             "terms": rules.n_terms,
             "terms_lower_bound": rules.lower_bound,
             "symmetry": rules.symmetry,
             "equally_good": equally_good,
-        },
-    }
-    if grids := [grid for grid in domain.grids if _is_whole(grid)]:
-        metadata["grids"] = [
-            {"name": grid.name, "start": grid.start, "rows": len(set(grid.rows)), "columns": len(set(grid.columns))}
-            for grid in grids
-        ]
+        }
+        if grids := [grid for grid in domain.grids if _is_whole(grid)]:
+            metadata["grids"] = [
+                {"name": grid.name, "start": grid.start, "rows": len(set(grid.rows)), "columns": len(set(grid.columns))}
+                for grid in grids
+            ]
     return Simplification(
         program=Program(**{**vars(small), "metadata": metadata}),
         terms_before=count_numbers(program),
@@ -204,9 +203,11 @@ def _of_pruned(program: ProgramData, pruned: Pruned, domain: Domain, began: floa
     symmetry = domain.symmetries[0].name if pruned.tied else None
     small = pruned.point.program
     terms = pruned.point.terms or count_numbers(program)
-    simplified = {"from": program_digest(program), "terms": terms, "symmetry": symmetry}
+    metadata = dict(program.metadata)
+    if small.body != program.body:
+        metadata["simplified"] = {"from": program_digest(program), "terms": terms, "symmetry": symmetry}
     return Simplification(
-        program=Program(**{**vars(small), "metadata": {**program.metadata, "simplified": simplified}}),
+        program=Program(**{**vars(small), "metadata": metadata}),
         terms_before=count_numbers(program),
         terms_after=terms,
         terms_lower_bound=0,
