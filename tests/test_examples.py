@@ -1,11 +1,13 @@
 """Every example runs as a user would run it, in a process of its own, with a small budget."""
 
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
 from sb3_progpolicy.programs import load_program
+from sb3_progpolicy.programs.io import program_digest
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 BUDGET = "4096"
@@ -50,8 +52,12 @@ def test_read_and_export_writes_every_format_of_a_program_trained_or_given(tmp_p
 def test_demo_prints_a_table_and_writes_program_picture_and_film(tmp_path):
     output = run("demo.py", tmp_path)
     rows = [line for line in output.splitlines() if "│" in line]
-    assert [row.split("│")[1].strip() for row in rows] == [str(n_discs) for n_discs in range(1, 9)]
+    sizes = [*range(1, 9), *range(1, 13)]  # the learnt program, then the simplified one
+    assert [row.split("│")[1].strip() for row in rows] == list(map(str, sizes))
     folder = tmp_path / "runs/demo"
     assert load_program(folder / "program.json").metadata["env"] == "Hanoi-v0"
     assert (folder / "program.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "hanoi.gif").read_bytes().startswith(b"GIF89a")
+    small = load_program(folder / "simplified.json")
+    assert json.loads((folder / "certificate.json").read_text())["program"] == program_digest(small)
+    assert "<!DOCTYPE html>" in (folder / "hanoi.html").read_text()

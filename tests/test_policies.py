@@ -52,6 +52,7 @@ def test_cartpole_is_solved(algorithm, policy):
     assert mean_return(model, "CartPole-v1") >= 195
 
 
+@pytest.mark.slow
 @BOTH
 def test_pendulum_is_learned(algorithm, policy):
     model = make(algorithm, policy, make_vec_env("Pendulum-v1", 16), **PENDULUM, policy_kwargs={"depth": 3})

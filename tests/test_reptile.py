@@ -231,6 +231,7 @@ def test_success_and_length_of_episodes_are_logged_per_variation():
     assert tasks.success_rates[0] == 1.0
 
 
+@pytest.mark.slow
 def test_cartpole_of_any_length_and_force_is_learned_by_stock_ppo():
     tasks = TaskDistribution({"length": [0.25, 0.5, 1.0], "force_mag": [7.0, 14.0]}, apply="attributes")
     model = make(n_envs=6, n_steps=128, batch_size=192, n_epochs=8, learning_rate=3e-3, gamma=0.98, ent_coef=0.0)

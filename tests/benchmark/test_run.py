@@ -79,7 +79,7 @@ def test_mistakes_on_the_command_line_are_named(tmp_path, capsys):
         assert message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("victim", ["runner", "worker"])
+@pytest.mark.parametrize("victim", ["runner", pytest.param("worker", marks=pytest.mark.slow)])
 def test_killed_cells_are_gone_on_with_to_the_same_rows(tmp_path, capsys, victim):
     settings = {"n_timesteps": 98_304, "n_envs": 32, "n_steps": 32, "length_coef": 0.0}
     suite = {**SMALL, "methods": {"reptile_ppo": settings}, "seeds": [0]}

@@ -274,6 +274,7 @@ def test_picture_shows_object_and_target_in_the_same_hue_and_changes_with_the_st
     env.close()
 
 
+@pytest.mark.slow
 def test_sac_with_hindsight_learns_to_reach():
     env = make("PandaReach-v0", observation="goal", reward_type="sparse", max_episode_steps=30)
     model = SAC(
