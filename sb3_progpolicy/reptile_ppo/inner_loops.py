@@ -66,11 +66,16 @@ class InnerLoops(ABC):
 
 
 class SerialLoops(InnerLoops):
-    """One after another, in the environments of the model."""
+    """One after another, in the environments of the model, with one thread of torch, as in the other engines."""
 
     def run(self, theta: Theta, begun: Sequence[Begun]) -> list[Theta]:
         """Return the theta_hat of each task."""
-        return [self.model.inner_loop(theta, *task) for task in begun]
+        threads = th.get_num_threads()
+        th.set_num_threads(1)
+        try:
+            return [self.model.inner_loop(theta, *task) for task in begun]
+        finally:
+            th.set_num_threads(threads)
 
 
 @dataclass(frozen=True)
