@@ -80,7 +80,7 @@ def test_saved_and_loaded_model_acts_alike_and_trains_on(algorithm, policy, env_
     model = make(algorithm, policy, env, n_steps=16, batch_size=16, policy_kwargs={"depth": 4, "temperature": 0.5})
     model.learn(64)
     model.save(tmp_path / "model")
-    loaded = algorithm.load(tmp_path / "model", env)
+    loaded = algorithm.load(tmp_path / "model", env, device="cpu")
     other = make(algorithm, policy, env, n_steps=16, batch_size=16, policy_kwargs={"depth": 4}, learning_rate=1.0)
     other.learn(64)
     other.set_parameters(model.get_parameters())
@@ -99,7 +99,7 @@ def test_policy_alone_is_saved_and_loaded(algorithm, policy, tmp_path):
     kwargs = {"depth": 3, "condition_size": 2, "net_arch": [8], "temperature": 0.3}
     model = make(algorithm, policy, "Pendulum-v1", policy_kwargs=kwargs)
     model.policy.save(tmp_path / "policy.pth")
-    loaded = policy.load(tmp_path / "policy.pth")
+    loaded = policy.load(tmp_path / "policy.pth", device="cpu")
     observation = np.ones((4, 3), np.float32)
     np.testing.assert_array_equal(
         model.policy.predict(observation, deterministic=True)[0], loaded.predict(observation, deterministic=True)[0]

@@ -310,8 +310,8 @@ class ProgramModule(nn.Module):
             self.conditions.cell,
             self.conditions.size,
             float(self.temperature),
-        )
-        module.conditions = self.conditions.keep(n_conditions)
+        ).to(self.controllers.weight.device)
+        module.conditions = self.conditions.keep(n_conditions).to(self.controllers.weight.device)
         # In the new graph only the deepest program is drawn, so only its controllers need values.
         rows = self._controller_rows(n_conditions)
         with th.no_grad():

@@ -121,7 +121,7 @@ def test_checkpoint_goes_on_to_the_same_end(tmp_path):
     whole = make().learn(ROLLOUT * 9 * 4)
     stopped = make()
     stopped.learn(ROLLOUT * 9 * 4, callback=CallbackList([ReptileCheckpoint(tmp_path / "model.zip"), Stop()]))
-    model = ReptilePPO.load(tmp_path / "model.zip", env="Hanoi-v0", engine="local")
+    model = ReptilePPO.load(tmp_path / "model.zip", env="Hanoi-v0", engine="local", device="cpu")
     assert model.num_timesteps == ROLLOUT * 9
     assert model.meta_batch_size == 3
     model.learn(ROLLOUT * 9 * 4 - model.num_timesteps, reset_num_timesteps=False)
