@@ -7,12 +7,13 @@ SOURCES := sb3_progpolicy envs examples benchmarks tests docs
 # Networks this small run faster on one thread each, and the tests on one process per core.
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 
-.PHONY: help install demo test test-long lint format bench docs clean
+.PHONY: help install demo test test-long smoke lint format bench docs clean
 
 help:
-	@echo "make demo     train on 1-4 discs, print the program and a table for 1-8 discs"
+	@echo "make demo     train on 1-4 discs, simplify the program, run it with up to 12 and write its page"
 	@echo "make test     run the tests"
 	@echo "make test-long  run the tests that take minutes: 100 000 random actions on each Panda task"
+	@echo "make smoke    compare all nine methods for two minutes, and report"
 	@echo "make lint     ruff and mypy;  make format  applies ruff's fixes"
 	@echo "make bench    measure speed: training against Stable-Baselines3, environments batched and in processes"
 	@echo "make docs     build the documentation into docs/_build/html"
@@ -31,6 +32,12 @@ demo: $(INSTALLED)
 
 test: $(INSTALLED)
 	$(ONE_THREAD) $(BIN)/python -m pytest -n 2
+
+# The smallest comparison of all nine methods, through the code of the large ones, and its report.
+smoke: $(INSTALLED)
+	rm -rf build/smoke && mkdir -p build/smoke
+	$(ONE_THREAD) $(BIN)/progpolicy benchmark run benchmarks/suites/smoke.yml --store build/smoke/results.db --jobs 2
+	$(ONE_THREAD) $(BIN)/progpolicy benchmark report build/smoke/results.db -o build/smoke/report
 
 test-long: $(INSTALLED)
 	$(ONE_THREAD) $(BIN)/python -m pytest -n 2 -m slow

@@ -48,13 +48,15 @@ from progpolicy_envs import DOMAINS
 from sb3_progpolicy import load_pretrained, make_fast_vec_env, pretrained_names
 from sb3_progpolicy.evaluation import Evaluation, evaluate_model, evaluate_program
 from sb3_progpolicy.interaction import VecInteractionHistory
-from sb3_progpolicy.programs import Program, ProgramRunner, export_c, export_python
+from sb3_progpolicy.programs import Program, ProgramRunner, export_c, export_python, load_program
 from sb3_progpolicy.spaces import ActionSpec
 
 COLUMNS = (
     "env", "policy", "numbers", "saved_bytes", "python_bytes", "mul_add", "comparisons", "python_us", "c_us",
     "library_us", "success", "unseen_success", "episodes",
 )  # fmt: skip
+#: Programs as `progpolicy simplify` leaves them.
+SIMPLIFIED = Path(__file__).parent / "results" / "simplified"
 DEPTH = 8
 DISTILLATION_SEED, EVALUATION_SEED = 0, 10_000
 # What a unit makes of its sums and its memory: 0.5 + 0.5 * tanh(0.5 * x) for a gate, then the update.
@@ -263,8 +265,10 @@ def success(env_id: str, evaluate: Callable[[Any], list[Evaluation]]) -> Row:
     }
 
 
-def measure_program(program: Program, env_id: str, x: Floats, options: argparse.Namespace) -> Row:
-    """Return the row of the program."""
+def measure_program(
+    program: Program, env_id: str, x: Floats, options: argparse.Namespace, policy_name: str = "program"
+) -> Row:
+    """Return the row of a program."""
     source = str(export_python(program))
     policy = loaded(source)["ProgramPolicy"]()
     observations = x[:, : program.n_observations].tolist()
@@ -274,7 +278,7 @@ def measure_program(program: Program, env_id: str, x: Floats, options: argparse.
         saved = (Path(folder) / "program.json").stat().st_size
     mul_add, comparisons = program_operations(program)
     return {
-        "policy": "program",
+        "policy": policy_name,
         "numbers": sum(count_nonzero(*part) for part in program_numbers(program)),
         "saved_bytes": saved,
         "python_bytes": len(source.encode()),
@@ -355,6 +359,8 @@ def measure(env_id: str, options: argparse.Namespace) -> list[Row]:
     program = load_pretrained(env_id)
     if not program.interaction or program.action.kind not in ("discrete", "box"):
         raise ValueError(f"{env_id}: programs that read the history and act in Discrete or Box spaces are accepted")
+    path = SIMPLIFIED / f"{env_id}.json"
+    simple = load_program(path) if path.is_file() else None
     venv = VecInteractionHistory(make_fast_vec_env(env_id, 1))
     try:
         space = venv.observation_space
@@ -362,6 +368,7 @@ def measure(env_id: str, options: argparse.Namespace) -> list[Row]:
         few = x[np.random.default_rng(0).permutation(len(x))[:2_000]]
         rows = [
             measure_program(program, env_id, few, options),
+            *([measure_program(simple, env_id, few, options, "program, simplified")] if simple else []),
             measure_mlp(program, env_id, few, venv, options),
             measure_tree(program, env_id, space, options, (x, actions)),
         ]

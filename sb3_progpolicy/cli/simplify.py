@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -32,6 +33,12 @@ def simplify(
     max_weight: Annotated[int, typer.Option("--max-weight", min=1, max=1000, help="largest whole number")] = 8,
     seed: Annotated[int, typer.Option("--seed", min=0, help="of the drawn starts")] = 0,
     episodes: Annotated[int, typer.Option("--episodes", min=1, help="of the comparison, on each variation")] = 20,
+    terms: Annotated[
+        int | None, typer.Option("--terms", min=1, help="continuous actions: take the program of so many terms")
+    ] = None,
+    curve: Annotated[
+        Path | None, typer.Option("--curve", help="continuous actions: .csv or .png of terms against success and steps")
+    ] = None,
     env: Annotated[str | None, typer.Option("--env", help="another environment than it was trained in")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="a JSON object on stdout, nothing else")] = False,
     allow_pickle: Annotated[bool, typer.Option("--allow-pickle", help=ALLOW_PICKLE)] = False,
@@ -44,6 +51,10 @@ def simplify(
         check_folder(output)
         if output.suffix.lower() != ".json":
             raise ValueError(f"-o {str(output)!r} is not accepted; the file is a .json")
+    if curve is not None:
+        check_folder(curve)
+        if curve.suffix.lower() not in (".csv", ".png"):
+            raise ValueError(f"--curve {str(curve)!r} is not accepted; the file is a .csv or a .png")
     from sb3_progpolicy.analysis.simplify import simplify as simplified
 
     with quiet_stdout():
@@ -62,8 +73,13 @@ def simplify(
             n_starts=starts,
             time_limit=time_limit,
             max_weight=max_weight,
+            n_terms=terms,
             seed=seed,
         )
+        if curve is not None:
+            if not found.curve:
+                raise ValueError("--curve is for continuous actions; of discrete ones the fewest terms are found")
+            _write_curve(found, curve)
         if output is not None:
             found.program.save(output)
         rows = _compared(source.program, found.program, env_id, episodes, seed)
@@ -74,6 +90,38 @@ def simplify(
     _print_summary(found, rows, env_id)
     if output is not None:
         typer.echo(f"Wrote {output}", err=True)
+
+
+def _write_curve(found: Simplification, path: Path) -> None:
+    """Write what programs of fewer and of more terms reach, as a table or a picture."""
+    from sb3_progpolicy.analysis.simplify import CURVE
+    from sb3_progpolicy.programs.files import write_atomically
+
+    if path.suffix.lower() == ".csv":
+        rows = [",".join(CURVE), *(",".join(str(getattr(point, name)) for name in CURVE) for point in found.curve)]
+        write_atomically(path, "\n".join(rows) + "\n")
+        return
+    try:
+        import matplotlib
+    except ImportError:
+        raise ValueError('png needs matplotlib: pip install "sb3-progpolicy[plot]"') from None
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, (above, below) = plt.subplots(2, 1, sharex=True, figsize=(6, 5), layout="constrained")
+    terms = [point.terms for point in found.curve]
+    above.plot(terms, [100 * point.success_rate for point in found.curve], "o-", color="#0f6b5c")
+    above.set(ylabel="success, %", ylim=(-4, 104), title="On the training variations")
+    below.plot(terms, [point.steps_mean for point in found.curve], "o-", color="#b4531f")
+    below.set(ylabel="steps", xlabel="terms", ylim=(0, None))
+    for axes in (above, below):
+        axes.axvline(found.terms_after, color="#8a8a8a", linestyle=":")
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.xaxis.get_major_locator().set_params(integer=True)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=150)
+    plt.close(figure)
+    write_atomically(path, buffer.getvalue())
 
 
 def _compared(original: Program, small: Program, env_id: str, episodes: int, seed: int) -> list[dict[str, object]]:

@@ -203,3 +203,31 @@ def test_command_writes_the_program_and_says_what_it_costs(tmp_path, capsys):
     assert "24 numbers before, 4 terms now, one rule for all pegs; no program of this form has fewer" in out
     assert run(["simplify", "Hanoi-v0", "-o", str(tmp_path / "small.txt")]) == 2
     assert ".json" in capsys.readouterr().err
+
+
+def test_curve_is_drawn_and_another_point_of_it_can_be_taken(tmp_path, monkeypatch, capsys):
+    import sb3_progpolicy.analysis.simplify as module
+    from sb3_progpolicy.analysis.box import Point, Pruned
+
+    program = load_pretrained("PandaReach-v0")
+    curve = tuple(Point(terms, program, terms / 3, 30.0 - terms) for terms in (1, 2, 3))
+    asked = []
+
+    def prune(*arguments, n_terms, **options):
+        asked.append(n_terms)
+        return Pruned(curve[(n_terms or 3) - 1], curve, 100, 9, True, ())
+
+    monkeypatch.setattr(module, "prune", prune)
+    monkeypatch.setattr("sb3_progpolicy.cli.simplify._compared", lambda *arguments: [])
+    for name in ("curve.csv", "curve.png"):
+        arguments = ["simplify", "PandaReach-v0", "--curve", str(tmp_path / name), "--terms", "2", "--json"]
+        assert run(arguments) == 0
+    assert json.loads(capsys.readouterr().out.partition("}\n{")[0] + "}")["terms_after"] == 2
+    assert asked == [2, 2]
+    lines = (tmp_path / "curve.csv").read_text().splitlines()
+    assert lines[0] == "terms,success_rate,steps_mean"
+    assert lines[3] == "3,1.0,27.0"
+    assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
+    assert run(["simplify", "Hanoi-v0", "--curve", str(tmp_path / "x.csv")]) == 2
+    assert "for continuous actions" in capsys.readouterr().err
+    assert run(["simplify", "Hanoi-v0", "--curve", str(tmp_path / "x.pdf")]) == 2
