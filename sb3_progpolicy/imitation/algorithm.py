@@ -1,0 +1,350 @@
+"""DAgger with decision lists: the student acts more and more, the teacher labels what it meets."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from progpolicy_envs import find_domain
+from sb3_progpolicy.imitation.actions import ActionCodec
+from sb3_progpolicy.imitation.conversion import rounded, to_program
+from sb3_progpolicy.imitation.decision_list import DecisionList
+from sb3_progpolicy.imitation.learner import Learner, Settings
+from sb3_progpolicy.imitation.rollouts import Collector, Episodes, Pool, Variations, play
+from sb3_progpolicy.imitation.saving import load_state, save_state
+from sb3_progpolicy.imitation.teachers import Teacher, TeacherLike, make_teacher
+from sb3_progpolicy.programs.interpreter import ProgramRunner
+from sb3_progpolicy.programs.program import Program
+from sb3_progpolicy.spaces import action_spec
+
+#: Share of the teacher in each round; 0 in all later ones.
+TEACHER_SHARES = (1.0, 0.6, 0.4, 0.3, 0.2, 0.1)
+N_ROUNDS, N_SPARSE_ROUNDS = 9, 2
+_TOLERANCES = (0.012, 0.006, 0.003, 0.0015)  # of the mean loss, the sparsest program first
+_DIGITS = (2, 3, 4, 6)
+#: Inputs that are not read by default: beyond the training sizes they take values that were never seen.
+IGNORED = ("left",)
+VALIDATION_SEED = 50_000_000  # no episode of the training has a seed near it
+
+
+@dataclass(frozen=True)
+class Imitation:
+    """How far an imitation has come.
+
+    :param round: rounds that are done
+    :param n_rounds: rounds in all
+    :param n_states: labelled states so far
+    :param score: of the best program: share of successes less a little for its steps, or its mean return
+    :param teacher_score: the teacher's
+    :param program: the best so far
+    """
+
+    round: int
+    n_rounds: int
+    n_states: int
+    score: float
+    teacher_score: float
+    program: Program
+
+
+def imitate(
+    teacher: TeacherLike,
+    env_id: str,
+    tasks: Variations | None = None,
+    n_timesteps: int = 24_000,
+    max_conditions: int = 11,
+    cell: str = "affine",
+    seed: int = 0,
+    *,
+    n_envs: int = 24,
+    ignore: Sequence[str] = IGNORED,
+    score_tolerance: float = 0.01,
+    n_episodes: int = 24,
+    env_kwargs: Mapping[str, Any] | None = None,
+    callback: Callable[[Imitation], None] | None = None,
+    checkpoint: Path | None = None,
+) -> Program:
+    """Return a program that does what a teacher does, learned from the teacher's actions, not from rewards.
+
+    .. code-block:: python
+
+        program = imitate("planner", "PandaPush-v0")
+        program = imitate(PPO("MlpPolicy", "CartPole-v1").learn(60_000), "CartPole-v1", n_timesteps=20_000)
+
+    States are visited by a mixture of teacher and student whose share of the teacher falls to 0, and labelled by the
+    teacher (DAgger, Ross et al. 2011). The program with the best episodes on training variations is made sparse and
+    round as far as its episodes stay as good. No other variation is looked at.
+
+    :param teacher: ``"planner"``, a model of Stable-Baselines3 or sb3-contrib, or a function from observations
+        ``(n_envs, n_observations)`` to actions
+    :param env_id: environment id
+    :param tasks: variations to learn on, the easiest first; by default those that the domain is trained on
+    :param n_timesteps: states to label
+    :param max_conditions: of the program at most
+    :param cell: of the conditions; ``"affine"``
+    :param seed: of all draws
+    :param n_envs: environments that are stepped together
+    :param ignore: names of inputs that the program must not read
+    :param score_tolerance: share of the score that fewer and rounder numbers may cost
+    :param n_episodes: of each validation, on training variations
+    :param env_kwargs: constructor arguments of the environment
+    :param callback: is called after each round
+    :param checkpoint: file in which the state is kept after each round; one that exists is gone on from
+    :return: the program; its metadata say that it was learned by imitation, and of whom
+    :raises ValueError: if an argument is not accepted
+    """
+    if cell != "affine":
+        raise ValueError(f"cell={cell!r} is not accepted; conditions of imitated programs are 'affine'")
+    n_shares = N_ROUNDS + 1 + N_SPARSE_ROUNDS  # the first round has two
+    if n_timesteps < n_shares * n_envs or max_conditions < 0 or n_episodes < 1:
+        raise ValueError(
+            f"n_timesteps={n_timesteps}, max_conditions={max_conditions}, n_episodes={n_episodes} are not accepted; "
+            f"at least {n_shares * n_envs} (for n_envs={n_envs}), 0 and 1 are"
+        )
+    pool = Pool(env_id, n_envs, env_kwargs)
+    try:
+        run = _Run(pool, teacher, env_id, tasks, seed, max_conditions + 1, ignore, n_episodes, score_tolerance)
+        return run.run(n_timesteps // (n_shares * n_envs), callback, checkpoint)
+    finally:
+        pool.close()
+
+
+class _Run:
+    """One imitation; see :func:`imitate`."""
+
+    def __init__(
+        self,
+        pool: Pool,
+        teacher: TeacherLike,
+        env_id: str,
+        tasks: Variations | None,
+        seed: int,
+        max_branches: int,
+        ignore: Sequence[str],
+        n_episodes: int,
+        score_tolerance: float,
+    ) -> None:
+        env: Any = pool.envs[0]
+        self.pool, self.env_id, self.seed, self.n_episodes = pool, env_id, seed, n_episodes
+        self.score_tolerance = score_tolerance
+        self.spec = action_spec(env.action_space)
+        self.inputs, self.outputs = names_of(env, self.spec.n_outputs)
+        self.codec = ActionCodec(self.spec, self.outputs)
+        self.teacher: Teacher = make_teacher(teacher, env)
+        self.variations, ranks = training_variations(env_id, tasks)
+        largest = max(ranks)
+        # The smaller sizes are the ends of the larger ones, which therefore say more.
+        self.validation = [one for one, rank in zip(self.variations, ranks, strict=True) if rank >= largest - 1]
+        self.collector = Collector(pool, self.teacher, self.variations, ranks, seed)
+        readable = np.array([name not in ignore for name in self.inputs])
+        self.learner = Learner(self.codec, readable, Settings(max_branches, seed))
+        self.best: tuple[float, DecisionList] | None = None
+        self.teacher_episodes: Episodes | None = None
+
+    def run(self, n_steps: int, callback: Callable[[Imitation], None] | None, checkpoint: Path | None) -> Program:
+        """Run all rounds, or those that a checkpoint leaves."""
+        origin = {"env": self.env_id, "teacher": self.teacher.name, "seed": self.seed, "n_steps": n_steps}
+        first = 0
+        if checkpoint is not None and checkpoint.exists():
+            first, self.best, self.collector.next_seed = load_state(checkpoint, origin, self.learner)
+            self.collector.rng = np.random.default_rng((self.seed, first))
+        self.teacher_episodes = play(self.pool, self.validation, self.n_episodes, VALIDATION_SEED, None, self.teacher)
+        self._limit_episodes()
+        self.collector.begin()
+        total = N_ROUNDS + N_SPARSE_ROUNDS
+        for number in range(first, total):
+            self._round(number, n_steps)
+            if checkpoint is not None:
+                save_state(checkpoint, origin, number + 1, self.learner, self.best, self.collector.next_seed)
+            if callback is not None:
+                callback(self._progress(number + 1, total))
+        return self._program(self._rounded())
+
+    def _round(self, number: int, n_steps: int) -> None:
+        learner = self.learner
+        share = TEACHER_SHARES[number] if number < len(TEACHER_SHARES) else 0.0
+        student = None if learner.raw is None else self._act(learner.raw)
+        visits = self.collector.collect(n_steps * (1 if number else 2), student, share)
+        learner.add(visits.observations, self.codec.encode(visits.actions), visits.weights)
+        if number < N_ROUNDS - 1:
+            for candidate in learner.fit(number):
+                if number >= N_ROUNDS // 2 - 1:
+                    self._offer(candidate)
+            return
+        if number == N_ROUNDS - 1:
+            for candidate in learner.finish():
+                self._offer(candidate)
+            self._make_sparse()
+            return
+        self._offer(learner.refit_sparse(), sparse=True)
+
+    def _make_sparse(self) -> None:
+        """Go on with the program of fewest inputs whose episodes are as good as the best ones."""
+        assert self.best is not None
+        score, dense = self.best
+        for tolerance in _TOLERANCES:
+            sparse = self.learner.sparse(dense, tolerance)
+            reached = self._score(sparse)
+            if self._as_good(reached, score):
+                self.best, self.learner.raw = (reached, sparse), sparse
+                return
+        self.learner.raw = dense
+
+    def _offer(self, candidate: DecisionList, sparse: bool = False) -> None:
+        """Keep a candidate if its episodes are better than the best so far."""
+        reached = self._score(candidate)
+        if self.best is None or reached >= self.best[0] or (sparse and self._as_good(reached, self.best[0])):
+            self.best = (reached, candidate)
+
+    def _rounded(self) -> DecisionList:
+        """Return the best list with as few digits as its episodes allow, its outputs in the unit of actions."""
+        assert self.best is not None
+        score, best = self.best
+        raw = DecisionList(best.conditions, self.codec.to_action_units(best.controllers))
+        for digits in _DIGITS:
+            candidate = rounded(raw, digits)
+            program = self._program(candidate)
+            if self._as_good(self._program_score(program), score, share=0.5):
+                return candidate
+        return raw
+
+    def _as_good(self, reached: float, score: float, share: float = 1.0) -> bool:
+        return reached >= score - share * self.score_tolerance * max(1.0, abs(score))
+
+    def _score(self, raw: DecisionList) -> float:
+        return self._play(self._act(raw)).score
+
+    def _program_score(self, program: Program) -> float:
+        return self._play(program_act(program, len(self.pool))).score
+
+    def _play(self, act: Any) -> Episodes:
+        episodes = play(self.pool, self.validation, self.n_episodes, VALIDATION_SEED, act)
+        self.collector.begin()
+        return episodes
+
+    def _act(self, raw: DecisionList) -> Any:
+        def act(observations: np.ndarray) -> np.ndarray:
+            with_constant = np.column_stack([observations.astype(np.float64), np.ones(len(observations))])
+            return self.codec.decode(raw.outputs(with_constant))
+
+        return act
+
+    def _limit_episodes(self) -> None:
+        """End episodes of the mixture that take far longer than the teacher's."""
+        assert self.teacher_episodes is not None
+        if len(self.teacher_episodes.successes):
+            self.collector.limit = min(self.pool.cap, int(2 * self.teacher_episodes.steps.max() + 50))
+
+    def _progress(self, number: int, total: int) -> Imitation:
+        assert self.teacher_episodes is not None
+        assert self.learner.raw is not None
+        score, raw = self.best if self.best is not None else (float("nan"), self.learner.raw)
+        in_units = DecisionList(raw.conditions, self.codec.to_action_units(raw.controllers))
+        return Imitation(
+            number, total, self.learner.n_states, score, self.teacher_episodes.score, self._program(in_units)
+        )
+
+    def _program(self, raw: DecisionList) -> Program:
+        return to_program(
+            raw,
+            self.spec,
+            self.inputs,
+            self.outputs,
+            env=self.env_id,
+            seed=self.seed,
+            learned_by="imitation",
+            teacher=self.teacher.name,
+            labelled_states=self.learner.n_states,
+        )
+
+
+def training_variations(env_id: str, tasks: Variations | None) -> tuple[Variations, list[int]]:
+    """Return the variations to learn on and the rank of each one's size.
+
+    :param env_id: environment id
+    :param tasks: variations, the easiest first; by default those that the domain is trained on
+    :raises ValueError: if there are none
+    """
+    domain = find_domain(env_id)
+    if tasks is not None and not len(tasks):
+        raise ValueError("tasks=[] is not accepted; at least one variation, such as {}, is needed")
+    variations = list(tasks) if tasks is not None else list(domain.train) if domain is not None else [{}]
+    if domain is None or not all(domain.size in variation for variation in variations):
+        return variations, [0] * len(variations)
+    sizes = sorted({variation[domain.size] for variation in variations})
+    return variations, [sizes.index(variation[domain.size]) for variation in variations]
+
+
+def names_of(env: Any, n_outputs: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return readable names of a program's inputs and outputs, the environment's own where it has them."""
+    n_observations = env.observation_space.shape[0]
+    inputs = tuple(map(str, getattr(env.unwrapped, "observation_names", ())))
+    outputs = tuple(map(str, getattr(env.unwrapped, "action_names", ())))
+    if len(inputs) != n_observations:
+        inputs = tuple(f"observation[{index}]" for index in range(n_observations))
+    if len(outputs) != n_outputs:
+        outputs = tuple(f"action[{index}]" for index in range(n_outputs))
+    return inputs, outputs
+
+
+def program_act(program: Program, n_envs: int) -> Any:
+    """Return the crisp program as a function from observations to actions."""
+    runner = ProgramRunner(program, n_envs)
+    return lambda observations: runner.act(observations)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A teacher and its program on the same episodes.
+
+    :param teacher: the teacher's means: return, steps and, where there is a goal, success
+    :param program: the program's
+    :param distance: of the program's actions from the teacher's in the states that the program visits: the share of
+        other actions if Discrete, else the mean over numbers, in half ranges of the action space
+    """
+
+    teacher: Mapping[str, float]
+    program: Mapping[str, float]
+    distance: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as JSON values."""
+        return dataclasses.asdict(self)
+
+
+def compare_with_teacher(
+    teacher: TeacherLike,
+    program: Program,
+    env_id: str,
+    tasks: Variations | None = None,
+    n_episodes: int = 30,
+    seed: int = 10_000,
+    env_kwargs: Mapping[str, Any] | None = None,
+) -> Comparison:
+    """Play the same episodes with a teacher and with a program.
+
+    :param teacher: see :func:`imitate`
+    :param program: to compare
+    :param env_id: environment id
+    :param tasks: variations to play on, in turn; by default those that the domain is trained on
+    :param n_episodes: on all of them together
+    :param seed: of the first episode
+    :param env_kwargs: constructor arguments of the environment
+    """
+    pool = Pool(env_id, min(n_episodes, 24), env_kwargs)
+    try:
+        env: Any = pool.envs[0]
+        judge = make_teacher(teacher, env)
+        codec = ActionCodec(program.action, program.output_names)
+        variations, _ = training_variations(env_id, tasks)
+        own = play(pool, variations, n_episodes, seed, None, judge)
+        act = program_act(program, len(pool))
+        imitated = play(pool, variations, n_episodes, seed, act, judge, codec.distance)
+        return Comparison(own.summary(), imitated.summary(), imitated.distance)
+    finally:
+        pool.close()
