@@ -31,6 +31,8 @@ class ActionCodec:
         self.bounded = np.isfinite(low) & np.isfinite(high)
         self.middle = np.where(self.bounded, (low + high) / 2, 0.0)
         self.half = np.where(self.bounded, (high - low) / 2, 1.0)
+        #: Size of a large output, ``(n_outputs,)``.
+        self.unit = self.half if spec.kind == "box" else np.ones(spec.n_outputs)
 
     def loss(self) -> Loss:
         """Return the loss of this action space; outputs named ``move_x``, ``move_y`` ... are one vector."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +14,9 @@ from sb3_progpolicy.imitation.actions import ActionCodec
 from sb3_progpolicy.imitation.conversion import rounded, to_program
 from sb3_progpolicy.imitation.decision_list import DecisionList
 from sb3_progpolicy.imitation.learner import Learner, Settings
-from sb3_progpolicy.imitation.rollouts import Collector, Episodes, Pool, Variations, play
+from sb3_progpolicy.imitation.rollouts import Collector, Episodes, Pool, Variations, play, program_act
 from sb3_progpolicy.imitation.saving import load_state, save_state
 from sb3_progpolicy.imitation.teachers import Teacher, TeacherLike, make_teacher
-from sb3_progpolicy.programs.interpreter import ProgramRunner
 from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.spaces import action_spec
 
@@ -207,7 +205,7 @@ class _Run:
         score, best = self.best
         raw = DecisionList(best.conditions, self.codec.to_action_units(best.controllers))
         for digits in _DIGITS:
-            candidate = rounded(raw, digits)
+            candidate = rounded(raw, digits, self.codec.unit)
             program = self._program(candidate)
             if self._as_good(self._program_score(program), score, share=0.5):
                 return candidate
@@ -273,7 +271,7 @@ def training_variations(env_id: str, tasks: Variations | None) -> tuple[Variatio
     domain = find_domain(env_id)
     if tasks is not None and not len(tasks):
         raise ValueError("tasks=[] is not accepted; at least one variation, such as {}, is needed")
-    variations = list(tasks) if tasks is not None else list(domain.train) if domain is not None else [{}]
+    variations: Variations = list(tasks) if tasks is not None else list(domain.train) if domain is not None else [{}]
     if domain is None or not all(domain.size in variation for variation in variations):
         return variations, [0] * len(variations)
     sizes = sorted({variation[domain.size] for variation in variations})
@@ -290,61 +288,3 @@ def names_of(env: Any, n_outputs: int) -> tuple[tuple[str, ...], tuple[str, ...]
     if len(outputs) != n_outputs:
         outputs = tuple(f"action[{index}]" for index in range(n_outputs))
     return inputs, outputs
-
-
-def program_act(program: Program, n_envs: int) -> Any:
-    """Return the crisp program as a function from observations to actions."""
-    runner = ProgramRunner(program, n_envs)
-    return lambda observations: runner.act(observations)
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """A teacher and its program on the same episodes.
-
-    :param teacher: the teacher's means: return, steps and, where there is a goal, success
-    :param program: the program's
-    :param distance: of the program's actions from the teacher's in the states that the program visits: the share of
-        other actions if Discrete, else the mean over numbers, in half ranges of the action space
-    """
-
-    teacher: Mapping[str, float]
-    program: Mapping[str, float]
-    distance: float
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the fields as JSON values."""
-        return dataclasses.asdict(self)
-
-
-def compare_with_teacher(
-    teacher: TeacherLike,
-    program: Program,
-    env_id: str,
-    tasks: Variations | None = None,
-    n_episodes: int = 30,
-    seed: int = 10_000,
-    env_kwargs: Mapping[str, Any] | None = None,
-) -> Comparison:
-    """Play the same episodes with a teacher and with a program.
-
-    :param teacher: see :func:`imitate`
-    :param program: to compare
-    :param env_id: environment id
-    :param tasks: variations to play on, in turn; by default those that the domain is trained on
-    :param n_episodes: on all of them together
-    :param seed: of the first episode
-    :param env_kwargs: constructor arguments of the environment
-    """
-    pool = Pool(env_id, min(n_episodes, 24), env_kwargs)
-    try:
-        env: Any = pool.envs[0]
-        judge = make_teacher(teacher, env)
-        codec = ActionCodec(program.action, program.output_names)
-        variations, _ = training_variations(env_id, tasks)
-        own = play(pool, variations, n_episodes, seed, None, judge)
-        act = program_act(program, len(pool))
-        imitated = play(pool, variations, n_episodes, seed, act, judge, codec.distance)
-        return Comparison(own.summary(), imitated.summary(), imitated.distance)
-    finally:
-        pool.close()

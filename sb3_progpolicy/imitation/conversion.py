@@ -42,15 +42,20 @@ def to_program(
     )
 
 
-def rounded(raw: DecisionList, digits: int) -> DecisionList:
+def rounded(raw: DecisionList, digits: int, unit: Floats) -> DecisionList:
     """Return the list with numbers of so many significant digits; a condition's largest weight becomes 1.
 
+    Constants of controllers are rounded to as many digits after the point, relative to what the controllers give.
+
     :param raw: on raw observations
-    :param digits: significant digits
+    :param digits: of each number
+    :param unit: size of an output that is large, ``(n_outputs,)``
     """
     largest = np.abs(raw.conditions[:, :-1]).max(axis=1, keepdims=True, initial=0.0)
     conditions = raw.conditions / np.where(largest > 0, largest, 1.0)
-    return DecisionList(significant(conditions, digits), significant(raw.controllers, digits))
+    controllers = significant(raw.controllers, digits)
+    controllers[..., -1] = significant(np.round(controllers[..., -1] / unit, digits) * unit, digits + 2)
+    return DecisionList(significant(conditions, digits), controllers)
 
 
 def significant(numbers: Floats, digits: int) -> Floats:

@@ -72,7 +72,7 @@ class Scaler:
         return np.column_stack([scaled, np.ones(len(observations))])
 
     def to_raw(self, weights: Floats) -> Floats:
-        """Return weights on raw inputs, ``(..., n_inputs + 1)``, for those on standardised ones, ``(..., n_kept + 1)``."""
+        """Return weights ``(..., n_inputs + 1)`` on raw inputs for ``(..., n_kept + 1)`` on standardised ones."""
         raw = np.zeros((*weights.shape[:-1], len(self.mean)))
         raw[..., self.kept] = weights[..., :-1] / self.scale[self.kept]
         return np.concatenate([raw, weights[..., -1:] - (raw * self.mean).sum(axis=-1, keepdims=True)], axis=-1)

@@ -10,6 +10,7 @@ from sb3_progpolicy.imitation.decision_list import Data, DecisionList, Floats
 from sb3_progpolicy.imitation.losses import Loss, list_losses, mean_loss
 
 _NEIGHBOURS = 120
+_FAILURES = 2  # draws of controllers in a row of which none helps
 _LEAST = 1e-3  # gains below it do not matter
 
 
@@ -33,15 +34,15 @@ def grow(
     :param tries: controllers tried for each branch
     """
     best = DecisionList(np.zeros((0, data.inputs.shape[1])), loss.fit(data)[None]) if start is None else start
-    while best.n_branches < max_branches:
-        before = mean_loss(loss, best, data)
+    failures = 0
+    while best.n_branches < max_branches and failures < _FAILURES:
         longer = _with_one_more(loss, best, data, rng, tries)
-        if longer is None:
-            break
-        longer = alternate(loss, longer, data, sweeps=1)
-        if mean_loss(loss, longer, data) > before * (1 - min_gain):
-            break
-        best = longer
+        if longer is not None:
+            longer = alternate(loss, longer, data, sweeps=1)
+        if longer is None or mean_loss(loss, longer, data) > mean_loss(loss, best, data) * (1 - min_gain):
+            failures += 1
+        else:
+            best, failures = longer, 0
     return best
 
 
@@ -97,7 +98,12 @@ def local_controllers(loss: Loss, data: Data, present: Floats, rng: np.random.Ge
     controllers = []
     for state in rng.choice(len(data), tries, p=chances / chances.sum()):
         near = np.argpartition(((places - places[state]) ** 2).sum(axis=1), size - 1)[:size]
-        controllers.append(loss.fit(data.take(near), iterations=4, ridge=1e-2))
+        part = data.take(near)
+        controller = loss.fit(part, iterations=4, ridge=1e-2)
+        for _ in range(2):  # neighbours may be of another branch: only the half that fits best is kept
+            losses = loss.matrix(part, controller[None])[:, 0]
+            controller = loss.fit(part.take(losses <= np.median(losses)), iterations=4, ridge=1e-2)
+        controllers.append(controller)
     return controllers
 
 

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from sb3_progpolicy.evaluation import spec_of
 from sb3_progpolicy.imitation.teachers import Observations, Situation, Teacher
+from sb3_progpolicy.programs.interpreter import ProgramRunner
+from sb3_progpolicy.programs.syntax import ProgramData
 from sb3_progpolicy.spaces import check_observation_space
 
 Act = Callable[[Observations], NDArray[Any]]
@@ -156,6 +158,12 @@ def _labels(pool: Pool, teacher: Teacher | None, live: Sequence[int]) -> NDArray
     return labels
 
 
+def program_act(program: ProgramData, n_envs: int) -> Act:
+    """Return the crisp program as a function from observations to actions."""
+    runner = ProgramRunner(program, n_envs)
+    return lambda observations: runner.act(observations)
+
+
 @dataclass
 class Visits:
     """States visited, with labels.
@@ -224,7 +232,7 @@ class Collector:
             observations.append(pool.observations.copy())
             labels.append(label)
             weights.append(np.where(stalled, STALL_WEIGHT, 1.0))
-            for row in np.flatnonzero(self._left <= 0):
+            for row in np.flatnonzero(self._left <= 0).tolist():
                 self._left[row], self._guided[row] = rng.integers(*_SEGMENT), rng.random() < share
             self._guided[stalled], self._left[stalled] = True, _RESCUE
             self._left -= 1

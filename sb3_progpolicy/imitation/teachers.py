@@ -10,13 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_progpolicy.interaction import interaction_space
+from sb3_progpolicy.programs.interpreter import ProgramRunner, join_inputs
+from sb3_progpolicy.programs.syntax import ProgramData
 from sb3_progpolicy.spaces import ActionSpec, action_spec, encode_actions
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
 Observations = NDArray[np.floating]
-TeacherLike = Union[str, "BaseAlgorithm", Callable[[Observations], NDArray[Any]], "Teacher"]
+TeacherLike = Union[str, "BaseAlgorithm", ProgramData, Callable[[Observations], NDArray[Any]], "Teacher"]
 PLANNER = "planner"
 
 
@@ -87,6 +89,30 @@ class FunctionTeacher:
         return actions
 
 
+class ProgramTeacher:
+    """A program, crisp, with its memory and its interaction history.
+
+    :param program: the program
+    """
+
+    def __init__(self, program: ProgramData) -> None:
+        self.program, self.name = program, "program"
+        self._runner: ProgramRunner | None = None
+
+    def begin(self) -> None:
+        """See :meth:`Teacher.begin`."""
+        self._runner = None
+
+    def label(self, situation: Situation) -> NDArray[Any]:
+        """See :meth:`Teacher.label`."""
+        if self._runner is None:
+            self._runner = ProgramRunner(self.program, len(situation.observations))
+        inputs = join_inputs(
+            self.program, situation.observations, situation.actions, situation.rewards, situation.dones
+        )
+        return self._runner.act(inputs)
+
+
 class ModelTeacher:
     """A model of SB3 or sb3-contrib with its most likely actions.
 
@@ -144,12 +170,14 @@ class ModelTeacher:
 def make_teacher(teacher: TeacherLike, env: Any) -> Teacher:
     """Return what labels states.
 
-    :param teacher: ``"planner"``, a model of SB3 or sb3-contrib, or a function from observations to actions
+    :param teacher: ``"planner"``, a model of SB3 or sb3-contrib, a program, or a function from observations to actions
     :param env: an environment in which it acts
     :raises ValueError: if it is none of these or does not fit the environment
     """
     if hasattr(teacher, "label"):
         return cast(Teacher, teacher)
+    if isinstance(teacher, ProgramData):
+        return ProgramTeacher(teacher)
     if isinstance(teacher, str):
         if teacher != PLANNER:
             raise _not_a_teacher(teacher)
@@ -160,7 +188,7 @@ def make_teacher(teacher: TeacherLike, env: Any) -> Teacher:
             raise ValueError(f"{name} has no planner; these have: {', '.join(DOMAINS)}")
         return PlannerTeacher()
     if hasattr(teacher, "predict") and hasattr(teacher, "get_vec_normalize_env"):
-        return ModelTeacher(teacher, env.observation_space, action_spec(env.action_space))
+        return ModelTeacher(cast(Any, teacher), env.observation_space, action_spec(env.action_space))
     if callable(teacher):
         return FunctionTeacher(teacher)
     raise _not_a_teacher(teacher)

@@ -64,7 +64,7 @@ def fine_tune(
         chances = _branch_chances(inputs[rows] @ conditions.T / (first * (last / first) ** done))
         objective = ((chances * losses).sum(dim=1) * weights[rows]).mean()
         optimizer.zero_grad()
-        objective.backward()  # type: ignore[no-untyped-call]
+        objective.backward()
         if keep_zeros:
             for parameter, mask in zip(parameters, masks, strict=True):
                 assert parameter.grad is not None
