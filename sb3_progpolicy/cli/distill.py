@@ -28,6 +28,9 @@ def distill(
     n_timesteps: Annotated[int, typer.Option("--n-timesteps", "-n", min=1, help="states to label")] = 24_000,
     max_conditions: Annotated[int, typer.Option("--max-conditions", min=0, help="of the program at most")] = 11,
     seed: Annotated[int, typer.Option("--seed", min=0, help="of all draws")] = 0,
+    augment: Annotated[
+        str | None, typer.Option("--augment", help="label states that were not visited, too: taller_towers")
+    ] = None,
     episodes: Annotated[int, typer.Option("--episodes", min=1, help="of the comparison with the teacher")] = 30,
     as_json: Annotated[bool, typer.Option("--json", help="a JSON object on stdout, nothing else")] = False,
     allow_pickle: Annotated[bool, typer.Option("--allow-pickle", help=ALLOW_PICKLE)] = False,
@@ -46,7 +49,7 @@ def distill(
 
         torch.set_num_threads(1)
         who, env_id, env_kwargs = _find_teacher(teacher, env, allow_pickle)
-        arguments = {"n_timesteps": n_timesteps, "max_conditions": max_conditions, "seed": seed}
+        arguments = {"n_timesteps": n_timesteps, "max_conditions": max_conditions, "seed": seed, "augment": augment}
         program = _imitated(who, env_id, output, {"tasks": chosen, "env_kwargs": env_kwargs, **arguments})
         from sb3_progpolicy.imitation import compare_with_teacher
 

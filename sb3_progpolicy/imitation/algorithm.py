@@ -11,6 +11,7 @@ import numpy as np
 
 from progpolicy_envs import find_domain
 from sb3_progpolicy.imitation.actions import ActionCodec
+from sb3_progpolicy.imitation.augmentation import Augment, make_augmentation
 from sb3_progpolicy.imitation.conversion import rounded, to_program
 from sb3_progpolicy.imitation.decision_list import DecisionList
 from sb3_progpolicy.imitation.learner import Learner, Settings
@@ -64,6 +65,7 @@ def imitate(
     score_tolerance: float = 0.01,
     n_episodes: int = 24,
     env_kwargs: Mapping[str, Any] | None = None,
+    augment: str | Augment | None = None,
     callback: Callable[[Imitation], None] | None = None,
     checkpoint: Path | None = None,
 ) -> Program:
@@ -91,6 +93,9 @@ def imitate(
     :param score_tolerance: share of the score that fewer and rounder numbers may cost
     :param n_episodes: of each validation, on training variations
     :param env_kwargs: constructor arguments of the environment
+    :param augment: makes states that were not visited, which the teacher labels too: a function from observations and
+        a generator to observations, or ``"taller_towers"`` for PandaStack. What was learned so was shown more than the
+        training variations; the metadata say so
     :param callback: is called after each round
     :param checkpoint: file in which the state is kept after each round; one that exists is gone on from
     :return: the program; its metadata say that it was learned by imitation, and of whom
@@ -106,7 +111,7 @@ def imitate(
         )
     pool = Pool(env_id, n_envs, env_kwargs)
     try:
-        run = _Run(pool, teacher, env_id, tasks, seed, max_conditions + 1, ignore, n_episodes, score_tolerance)
+        run = _Run(pool, teacher, env_id, tasks, seed, max_conditions + 1, ignore, n_episodes, score_tolerance, augment)
         return run.run(n_timesteps // (n_shares * n_envs), callback, checkpoint)
     finally:
         pool.close()
@@ -126,9 +131,10 @@ class _Run:
         ignore: Sequence[str],
         n_episodes: int,
         score_tolerance: float,
+        augment: str | Augment | None,
     ) -> None:
         env: Any = pool.envs[0]
-        self.pool, self.env_id, self.seed, self.n_episodes = pool, env_id, seed, n_episodes
+        self.pool, self.seed, self.n_episodes = pool, seed, n_episodes
         self.score_tolerance = score_tolerance
         self.spec = action_spec(env.action_space)
         self.inputs, self.outputs = names_of(env, self.spec.n_outputs)
@@ -138,7 +144,11 @@ class _Run:
         largest = max(ranks)
         # The smaller sizes are the ends of the larger ones, which therefore say more.
         self.validation = [one for one, rank in zip(self.variations, ranks, strict=True) if rank >= largest - 1]
-        self.collector = Collector(pool, self.teacher, self.variations, ranks, seed)
+        augmentation = make_augmentation(augment, self.inputs)
+        self.collector = Collector(pool, self.teacher, self.variations, ranks, seed, augmentation)
+        self.origin: dict[str, Any] = {"env": env_id, "seed": seed, "teacher": self.teacher.name}
+        if augment is not None:
+            self.origin["augment"] = augment if isinstance(augment, str) else getattr(augment, "__name__", "function")
         readable = np.array([name not in ignore for name in self.inputs])
         self.learner = Learner(self.codec, readable, Settings(max_branches, seed))
         self.best: tuple[float, DecisionList] | None = None
@@ -146,7 +156,7 @@ class _Run:
 
     def run(self, n_steps: int, callback: Callable[[Imitation], None] | None, checkpoint: Path | None) -> Program:
         """Run all rounds, or those that a checkpoint leaves."""
-        origin = {"env": self.env_id, "teacher": self.teacher.name, "seed": self.seed, "n_steps": n_steps}
+        origin = {**self.origin, "n_steps": n_steps}
         first = 0
         if checkpoint is not None and checkpoint.exists():
             first, self.best, self.collector.next_seed = load_state(checkpoint, origin, self.learner)
@@ -253,10 +263,8 @@ class _Run:
             self.spec,
             self.inputs,
             self.outputs,
-            env=self.env_id,
-            seed=self.seed,
+            **self.origin,
             learned_by="imitation",
-            teacher=self.teacher.name,
             labelled_states=self.learner.n_states,
         )
 

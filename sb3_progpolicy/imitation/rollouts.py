@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_progpolicy.evaluation import spec_of
+from sb3_progpolicy.imitation.augmentation import Augment
 from sb3_progpolicy.imitation.teachers import Observations, Situation, Teacher
 from sb3_progpolicy.programs.interpreter import ProgramRunner
 from sb3_progpolicy.programs.syntax import ProgramData
@@ -194,9 +195,19 @@ class Collector:
     :param variations: to draw from, the easiest first
     :param ranks: size of each variation as a number from 0 on
     :param seed: of the draws and of the episodes
+    :param augment: makes changed copies of half of the states, which are labelled too
     """
 
-    def __init__(self, pool: Pool, teacher: Teacher, variations: Variations, ranks: Sequence[int], seed: int) -> None:
+    def __init__(
+        self,
+        pool: Pool,
+        teacher: Teacher,
+        variations: Variations,
+        ranks: Sequence[int],
+        seed: int,
+        augment: Augment | None = None,
+    ) -> None:
+        self.augment = augment
         self.pool, self.teacher, self.variations = pool, teacher, variations
         chances = np.array([2.0 ** min(rank, 6) / ranks.count(rank) for rank in ranks])
         self.chances = chances / chances.sum()
@@ -250,6 +261,12 @@ class Collector:
                     self._reset(row)
         visits.observations, visits.actions = np.concatenate(observations), np.concatenate(labels)
         visits.weights = np.concatenate(weights)
+        if self.augment is not None:
+            chosen = rng.random(len(visits.observations)) < 0.5
+            changed = self.augment(visits.observations[chosen], rng)
+            labels = [visits.actions, self.teacher.label_alone(changed, pool.envs[0])]
+            visits.observations = np.concatenate([visits.observations, changed])
+            visits.actions, visits.weights = np.concatenate(labels), np.append(visits.weights, np.ones(len(changed)))
         return visits
 
     def _reset(self, row: int) -> None:

@@ -51,6 +51,12 @@ class Teacher(Protocol):
     def label(self, situation: Situation) -> NDArray[Any]:
         """Return the teacher's actions ``(n_envs, *action_shape)``."""
 
+    def label_alone(self, observations: Observations, env: Any) -> NDArray[Any]:
+        """Return actions for observations that no environment is in, ``(n, *action_shape)``.
+
+        :raises ValueError: if this teacher cannot tell
+        """
+
 
 class PlannerTeacher:
     """The first action of ``env.unwrapped.plan()``: a shortest solution, or the scripted controller of a Panda task."""
@@ -63,6 +69,13 @@ class PlannerTeacher:
     def label(self, situation: Situation) -> NDArray[Any]:
         """See :meth:`Teacher.label`."""
         return np.array([next(iter(env.unwrapped.plan())) for env in situation.envs])
+
+    def label_alone(self, observations: Observations, env: Any) -> NDArray[Any]:
+        """Ask the scripted controller, where there is one. See :meth:`Teacher.label_alone`."""
+        controller = getattr(type(env.unwrapped), "controller", None)
+        if controller is None:
+            raise _needs_states(self.name)
+        return np.array([controller(observation) for observation in observations])
 
 
 class FunctionTeacher:
@@ -88,6 +101,10 @@ class FunctionTeacher:
             )
         return actions
 
+    def label_alone(self, observations: Observations, env: Any) -> NDArray[Any]:
+        """See :meth:`Teacher.label_alone`."""
+        return np.asarray(self.function(observations))
+
 
 class ProgramTeacher:
     """A program, crisp, with its memory and its interaction history.
@@ -111,6 +128,10 @@ class ProgramTeacher:
             self.program, situation.observations, situation.actions, situation.rewards, situation.dones
         )
         return self._runner.act(inputs)
+
+    def label_alone(self, observations: Observations, env: Any) -> NDArray[Any]:
+        """See :meth:`Teacher.label_alone`."""
+        raise _needs_states(self.name)
 
 
 class ModelTeacher:
@@ -166,6 +187,10 @@ class ModelTeacher:
         actions, self._state = self.model.predict(observations, self._state, situation.dones, deterministic=True)
         return actions
 
+    def label_alone(self, observations: Observations, env: Any) -> NDArray[Any]:
+        """See :meth:`Teacher.label_alone`."""
+        raise _needs_states(self.name)
+
 
 def make_teacher(teacher: TeacherLike, env: Any) -> Teacher:
     """Return what labels states.
@@ -192,6 +217,13 @@ def make_teacher(teacher: TeacherLike, env: Any) -> Teacher:
     if callable(teacher):
         return FunctionTeacher(teacher)
     raise _not_a_teacher(teacher)
+
+
+def _needs_states(name: str) -> ValueError:
+    return ValueError(
+        f"augment is not accepted for the teacher {name}, which needs more than an observation; functions and scripted "
+        "controllers do not"
+    )
 
 
 def _not_a_teacher(given: object) -> ValueError:

@@ -1,6 +1,7 @@
 """Whole imitations in small: teachers, visited states, checkpoints and the command line."""
 
 import json
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +15,7 @@ from sb3_progpolicy import compare_with_teacher, imitate, load_pretrained
 from sb3_progpolicy.cli import run
 from sb3_progpolicy.imitation import algorithm, make_teacher
 from sb3_progpolicy.imitation.algorithm import training_variations
+from sb3_progpolicy.imitation.learner import Settings
 from sb3_progpolicy.imitation.rollouts import STALL_WEIGHT, Collector, Pool, play
 from sb3_progpolicy.interaction import VecInteractionHistory
 from sb3_progpolicy.programs import Program, ProgramRunner
@@ -26,8 +28,15 @@ def balance(observations):
     return (observations @ [0.1, 0.5, 1.0, 1.0] > 0).astype(np.int64)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_gradient_steps():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(algorithm, "Settings", partial(Settings, round_steps=20, final_steps=100))
+        yield
+
+
 @pytest.fixture(scope="module")
-def balanced():
+def balanced(few_gradient_steps):
     return imitate(balance, "CartPole-v1", seed=1, **SMALL)
 
 
