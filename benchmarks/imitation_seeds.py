@@ -5,7 +5,7 @@
 
 Each seed imitates from scratch, on training variations alone. Its program is then run crisp on these, on starts that
 were not used before; with --final on the validation and the unseen ones too, which nothing is chosen by. The teacher's
-own results are the rows of the seed "teacher". A finished seed is kept in ``runs/``, so that an interrupted study goes on.
+own results are the rows of the seed "teacher". A finished seed is kept in ``runs/``: an interrupted study goes on.
 
 Writes ``benchmarks/results/<name>.csv`` and a ``.json`` with command, commit and versions.
 """

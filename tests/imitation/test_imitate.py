@@ -1,5 +1,6 @@
 """Whole imitations in small: teachers, visited states, checkpoints and the command line."""
 
+import dataclasses
 import json
 from functools import partial
 
@@ -11,10 +12,12 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from progpolicy_envs.panda import PandaStackEnv
 from sb3_progpolicy import compare_with_teacher, imitate, load_pretrained
 from sb3_progpolicy.cli import run
 from sb3_progpolicy.imitation import algorithm, make_teacher
 from sb3_progpolicy.imitation.algorithm import training_variations
+from sb3_progpolicy.imitation.augmentation import taller_towers
 from sb3_progpolicy.imitation.learner import Settings
 from sb3_progpolicy.imitation.rollouts import STALL_WEIGHT, Collector, Pool, play
 from sb3_progpolicy.interaction import VecInteractionHistory
@@ -53,6 +56,32 @@ def test_program_says_how_it_was_learned(balanced, tmp_path):
     assert balanced.metadata["env"] == "CartPole-v1"
     balanced.save(tmp_path / "program.json")
     assert Program.load(tmp_path / "program.json") == balanced
+
+
+def test_show_says_how_a_program_was_learned(balanced, tmp_path, capsys):
+    balanced.save(tmp_path / "program.json")
+    for name, learned in ((str(tmp_path / "program.json"), "imitation"), ("Hanoi-v0", "reinforcement")):
+        assert run(["show", name]) == 0
+        assert f"Learned by {learned}." in capsys.readouterr().err
+    forged = dataclasses.replace(balanced, metadata={"learned_by": "a genius"})
+    assert forged.learned_by == "unknown"
+
+
+def test_taller_towers_are_labelled_by_the_scripted_controller():
+    names = PandaStackEnv.observation_names
+    place = {name: index for index, name in enumerate(names)}
+    low = np.zeros((400, len(names)), np.float32)
+    raised = taller_towers(names)(low, np.random.default_rng(0))
+    assert (raised[:, place["target_z"]] > 0.03).all()
+    moved = {names[column] for column in np.flatnonzero((raised != low).any(axis=0))}
+    assert moved == {"gripper_z", "target_z", "target_dz", "object_dz"}
+    for way, thing in (("target_dz", "target_z"), ("object_dz", "object_z")):
+        difference = raised[:, place[thing]] - raised[:, place["gripper_z"]]
+        np.testing.assert_allclose(raised[:, place[way]], difference, atol=1e-6)
+    with pytest.raises(ValueError, match="has no gripper_z"):
+        imitate("planner", "Stacking-v0", augment="taller_towers")
+    with pytest.raises(ValueError, match="needs more than an observation"):
+        imitate("planner", "Stacking-v0", augment=lambda observations, rng: observations, **SMALL)
 
 
 def test_same_seed_gives_the_same_program(balanced):
@@ -95,7 +124,7 @@ def test_planner_is_imitated_on_training_variations_only(monkeypatch):
         reset(self, row, seed, variation)
 
     monkeypatch.setattr(Pool, "reset", spy)
-    program = imitate("planner", "Stacking-v0", **{**SMALL, "max_conditions": 5})
+    program = imitate("planner", "Stacking-v0", **{**SMALL, "max_conditions": 2})
     assert seen == {(("n_plates", n),) for n in (1, 2, 3, 4)}
     assert program.metadata["teacher"] == "planner"
 
@@ -207,7 +236,7 @@ def test_command_line_distills_a_planner(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(algorithm, "N_ROUNDS", 3)
     output = tmp_path / "program.json"
     arguments = ["distill", "--from", "planner", "--env", "Stacking-v0", "--set", "n_plates=1", "-n", "1000"]
-    assert run([*arguments, "--max-conditions", "4", "--episodes", "4", "-o", str(output)]) == 0
+    assert run([*arguments, "--max-conditions", "2", "--episodes", "4", "-o", str(output)]) == 0
     printed = capsys.readouterr().out
     assert "Program for Stacking-v0" in printed
     assert "of its actions are the teacher's" in printed
