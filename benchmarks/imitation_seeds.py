@@ -56,7 +56,7 @@ def rows_of(seed: Any, env_id: str, teacher: Any, program: Program | None, episo
     sets = [("train", domain.train if domain is not None else ({},))]
     if domain is not None and final:
         sets += [("validation", domain.validation), ("unseen", domain.unseen)]
-    pool = Pool(env_id, min(episodes, 24))
+    pool = Pool(env_id, min(episodes, 24), interaction=program is not None and program.interaction)
     judge = make_teacher(teacher, pool.envs[0])
     act = None if program is None else program_act(program, len(pool))
     for kind, variations in sets:
@@ -111,6 +111,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=100, help="episodes on each variation")
     parser.add_argument("--n-timesteps", type=int, default=24_000, help="states to label")
     parser.add_argument("--max-conditions", type=int, default=11, help="of the program at most")
+    parser.add_argument("--interaction", action="store_true", help="read the previous action, reward and done flag")
     parser.add_argument("--augment", help="label states that were not visited, too: taller_towers")
     parser.add_argument("--ppo", type=int, help="imitate a network that PPO has trained for so many steps")
     parser.add_argument("--final", action="store_true", help="look at the validation and the unseen variations, too")
@@ -120,7 +121,7 @@ def main() -> None:
     spec_of(options.env)
     name = options.name or f"imitation_{options.env.rpartition('-')[0].lower()}"
     folder = Path("runs") / name
-    arguments = {key: getattr(options, key) for key in ("n_timesteps", "max_conditions", "augment")}
+    arguments = {key: getattr(options, key) for key in ("n_timesteps", "max_conditions", "augment", "interaction")}
     teacher = trained_ppo(options.env, options.ppo, folder) if options.ppo else "planner"
     rows = rows_of("teacher", options.env, teacher, None, options.episodes, options.final)
     for seed in track(range(options.seeds), "Seeds"):

@@ -28,6 +28,9 @@ def distill(
     n_timesteps: Annotated[int, typer.Option("--n-timesteps", "-n", min=1, help="states to label")] = 24_000,
     max_conditions: Annotated[int, typer.Option("--max-conditions", min=0, help="of the program at most")] = 11,
     seed: Annotated[int, typer.Option("--seed", min=0, help="of all draws")] = 0,
+    interaction: Annotated[
+        bool, typer.Option("--interaction", help="let it read its previous action, reward and done flag, too")
+    ] = False,
     augment: Annotated[
         str | None, typer.Option("--augment", help="label states that were not visited, too: taller_towers")
     ] = None,
@@ -49,7 +52,13 @@ def distill(
 
         torch.set_num_threads(1)
         who, env_id, env_kwargs = _find_teacher(teacher, env, allow_pickle)
-        arguments = {"n_timesteps": n_timesteps, "max_conditions": max_conditions, "seed": seed, "augment": augment}
+        arguments = {
+            "n_timesteps": n_timesteps,
+            "max_conditions": max_conditions,
+            "seed": seed,
+            "augment": augment,
+            "interaction": interaction,
+        }
         program = _imitated(who, env_id, output, {"tasks": chosen, "env_kwargs": env_kwargs, **arguments})
         from sb3_progpolicy.imitation import compare_with_teacher
 

@@ -61,6 +61,7 @@ def imitate(
     seed: int = 0,
     *,
     n_envs: int = 24,
+    interaction: bool = False,
     ignore: Sequence[str] = IGNORED,
     score_tolerance: float = 0.01,
     n_episodes: int = 24,
@@ -89,6 +90,7 @@ def imitate(
     :param cell: of the conditions; ``"affine"``
     :param seed: of all draws
     :param n_envs: environments that are stepped together
+    :param interaction: whether the program reads its previous action, reward and done flag, too
     :param ignore: names of inputs that the program must not read
     :param score_tolerance: share of the score that fewer and rounder numbers may cost
     :param n_episodes: of each validation, on training variations
@@ -109,7 +111,7 @@ def imitate(
             f"n_timesteps={n_timesteps}, max_conditions={max_conditions}, n_episodes={n_episodes} are not accepted; "
             f"at least {n_shares * n_envs} (for n_envs={n_envs}), 0 and 1 are"
         )
-    pool = Pool(env_id, n_envs, env_kwargs)
+    pool = Pool(env_id, n_envs, env_kwargs, interaction)
     try:
         run = _Run(pool, teacher, env_id, tasks, seed, max_conditions + 1, ignore, n_episodes, score_tolerance, augment)
         return run.run(n_timesteps // (n_shares * n_envs), callback, checkpoint)
@@ -137,7 +139,7 @@ class _Run:
         self.pool, self.seed, self.n_episodes = pool, seed, n_episodes
         self.score_tolerance = score_tolerance
         self.spec = action_spec(env.action_space)
-        self.inputs, self.outputs = names_of(env, self.spec.n_outputs)
+        self.inputs, self.outputs = names_of(env, self.spec.n_outputs, pool.interaction)
         self.codec = ActionCodec(self.spec, self.outputs)
         self.teacher: Teacher = make_teacher(teacher, env)
         self.variations, ranks = training_variations(env_id, tasks)
@@ -178,7 +180,8 @@ class _Run:
         share = TEACHER_SHARES[number] if number < len(TEACHER_SHARES) else 0.0
         student = None if learner.raw is None else self._act(learner.raw)
         visits = self.collector.collect(n_steps * (1 if number else 2), student, share)
-        learner.add(visits.observations, self.codec.encode(visits.actions), visits.weights)
+        targets = self.codec.encode(visits.actions) if visits.good is None else visits.good.astype(np.float64)
+        learner.add(visits.inputs, targets, visits.weights)
         if number < N_ROUNDS - 1:
             for candidate in learner.fit(number):
                 if number >= N_ROUNDS // 2 - 1:
@@ -236,8 +239,8 @@ class _Run:
         return episodes
 
     def _act(self, raw: DecisionList) -> Any:
-        def act(observations: np.ndarray) -> np.ndarray:
-            with_constant = np.column_stack([observations.astype(np.float64), np.ones(len(observations))])
+        def act(inputs: np.ndarray) -> np.ndarray:
+            with_constant = np.column_stack([inputs.astype(np.float64), np.ones(len(inputs))])
             return self.codec.decode(raw.outputs(with_constant))
 
         return act
@@ -263,6 +266,7 @@ class _Run:
             self.spec,
             self.inputs,
             self.outputs,
+            self.pool.interaction,
             **self.origin,
             learned_by="imitation",
             labelled_states=self.learner.n_states,
@@ -286,8 +290,13 @@ def training_variations(env_id: str, tasks: Variations | None) -> tuple[Variatio
     return variations, [sizes.index(variation[domain.size]) for variation in variations]
 
 
-def names_of(env: Any, n_outputs: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return readable names of a program's inputs and outputs, the environment's own where it has them."""
+def names_of(env: Any, n_outputs: int, interaction: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return readable names of a program's inputs and outputs, the environment's own where it has them.
+
+    :param env: an environment
+    :param n_outputs: of a controller
+    :param interaction: whether the previous action, reward and done flag are inputs, too
+    """
     n_observations = env.observation_space.shape[0]
     inputs = tuple(map(str, getattr(env.unwrapped, "observation_names", ())))
     outputs = tuple(map(str, getattr(env.unwrapped, "action_names", ())))
@@ -295,4 +304,6 @@ def names_of(env: Any, n_outputs: int) -> tuple[tuple[str, ...], tuple[str, ...]
         inputs = tuple(f"observation[{index}]" for index in range(n_observations))
     if len(outputs) != n_outputs:
         outputs = tuple(f"action[{index}]" for index in range(n_outputs))
+    if interaction:
+        inputs = (*inputs, *(f"previous {name}" for name in outputs), "previous reward", "previous done")
     return inputs, outputs

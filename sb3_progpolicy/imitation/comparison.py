@@ -52,7 +52,7 @@ def compare_with_teacher(
     :param seed: of the first episode
     :param env_kwargs: constructor arguments of the environment
     """
-    pool = Pool(env_id, min(n_episodes, 24), env_kwargs)
+    pool = Pool(env_id, min(n_episodes, 24), env_kwargs, program.interaction)
     try:
         env: Any = pool.envs[0]
         judge = make_teacher(teacher, env)

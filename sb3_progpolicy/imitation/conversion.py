@@ -13,14 +13,20 @@ from sb3_progpolicy.spaces import ActionSpec
 
 
 def to_program(
-    raw: DecisionList, spec: ActionSpec, input_names: tuple[str, ...], output_names: tuple[str, ...], **metadata: Any
+    raw: DecisionList,
+    spec: ActionSpec,
+    input_names: tuple[str, ...],
+    output_names: tuple[str, ...],
+    interaction: bool,
+    **metadata: Any,
 ) -> Program:
     """Return a program.
 
     :param raw: on raw observations, with outputs in the unit of the actions
     :param spec: the action space
-    :param input_names: one for each number of an observation
+    :param input_names: one for each number of X
     :param output_names: one for each output
+    :param interaction: whether X goes on with the previous action, reward and done flag
     :param metadata: JSON values to keep with it
     """
     controllers = [
@@ -33,9 +39,9 @@ def to_program(
         body = IfThenElse(condition, controller, body)
     return Program(
         body=body,
-        n_observations=len(input_names),
+        n_observations=len(input_names) - (spec.interaction_size if interaction else 0),
         action=spec,
-        interaction=False,
+        interaction=interaction,
         input_names=input_names,
         output_names=output_names,
         metadata=metadata,

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from sb3_progpolicy.evaluation import spec_of
 from sb3_progpolicy.imitation.augmentation import Augment
-from sb3_progpolicy.imitation.teachers import Observations, Situation, Teacher
+from sb3_progpolicy.imitation.teachers import Observations, PlannerTeacher, Situation, Teacher, join_history
 from sb3_progpolicy.programs.interpreter import ProgramRunner
 from sb3_progpolicy.programs.syntax import ProgramData
-from sb3_progpolicy.spaces import check_observation_space
+from sb3_progpolicy.spaces import action_spec, check_observation_space
 
 Act = Callable[[Observations], NDArray[Any]]
 Variations = Sequence[Mapping[str, Any]]
@@ -32,13 +32,18 @@ class Pool:
     :param env_id: environment id
     :param n_envs: how many
     :param env_kwargs: constructor arguments
+    :param interaction: whether a student reads the previous action, reward and done flag too
     :raises ValueError: if the id is not known or the observations are not accepted
     """
 
-    def __init__(self, env_id: str, n_envs: int, env_kwargs: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self, env_id: str, n_envs: int, env_kwargs: Mapping[str, Any] | None = None, interaction: bool = False
+    ) -> None:
+        self.interaction = interaction
         spec = spec_of(env_id)
-        self.envs = [gym.make(spec.id, **(env_kwargs or {})) for _ in range(n_envs)]
+        self.envs: list[Any] = [gym.make(spec.id, **(env_kwargs or {})) for _ in range(n_envs)]
         space = check_observation_space(self.envs[0].observation_space)
+        self.spec = action_spec(self.envs[0].action_space)
         self.cap = spec.max_episode_steps or 10_000
         self.observations = np.zeros((n_envs, *space.shape), dtype=np.float32)
         self.rewards, self.dones = np.zeros(n_envs, dtype=np.float32), np.zeros(n_envs, dtype=bool)
@@ -46,6 +51,17 @@ class Pool:
 
     def __len__(self) -> int:
         return len(self.envs)
+
+    @property
+    def inputs(self) -> NDArray[np.float32]:
+        """What a student reads now, ``(n_envs, n_inputs)``."""
+        if not self.interaction:
+            return self.observations.copy()
+        return join_history(self.observations, self.actions, self.rewards, self.dones, self.spec)
+
+    def begin(self) -> None:
+        """Forget what was done before, as at the start of a task."""
+        self.actions, self.dones[:], self.rewards[:] = None, False, 0
 
     def reset(self, row: int, seed: int, variation: Mapping[str, Any]) -> None:
         """Begin an episode."""
@@ -123,13 +139,13 @@ def play(
         rows = range(min(len(pool), n_episodes - first))
         if teacher is not None:
             teacher.begin()
-        pool.actions, pool.dones[:], pool.rewards[:] = None, False, 0
+        pool.begin()
         for row in rows:
             pool.reset(row, seed + first + row, variations[(first + row) % len(variations)])
         live = list(rows)
         while live:
             labels = _labels(pool, teacher, live) if act is None or distance is not None else None
-            actions = labels if act is None else act(pool.observations)
+            actions = labels if act is None else act(pool.inputs)
             assert actions is not None
             if distance is not None and act is not None and labels is not None:
                 distances.append(distance(actions[live], labels[live]))
@@ -169,18 +185,20 @@ def program_act(program: ProgramData, n_envs: int) -> Act:
 class Visits:
     """States visited, with labels.
 
-    :param observations: ``(n, n_observations)``
+    :param inputs: what a student reads, ``(n, n_inputs)``
     :param actions: the teacher's, ``(n, *action_shape)``
     :param weights: ``(n,)``; more where the student stands still
     :param n_stalls: how often it stood still
     :param ended: success and steps of the episodes that ended
+    :param good: all actions that are as good as the teacher's, ``(n, n_actions)``; ``None`` if that is not known
     """
 
-    observations: NDArray[np.float32]
+    inputs: NDArray[np.float32]
     actions: NDArray[Any]
     weights: NDArray[np.float64]
     n_stalls: int = 0
     ended: list[tuple[bool, int]] = field(default_factory=list)
+    good: NDArray[np.bool_] | None = None
 
 
 class Collector:
@@ -216,13 +234,13 @@ class Collector:
         self.limit = pool.cap
         self._guided, self._left = np.zeros(len(pool), dtype=bool), np.zeros(len(pool), dtype=np.int64)
         self._elapsed = np.zeros(len(pool), dtype=np.int64)
-        self._seen: list[dict[bytes, int]] = [{} for _ in range(len(pool))]
+        self._seen: list[dict[str | bytes, int]] = [{} for _ in range(len(pool))]
         self._has_goal = False
 
     def begin(self) -> None:
         """Begin episodes in all environments."""
         self.teacher.begin()
-        self.pool.actions, self.pool.dones[:], self.pool.rewards[:] = None, False, 0
+        self.pool.begin()
         for row in range(len(self.pool)):
             self._reset(row)
 
@@ -235,19 +253,23 @@ class Collector:
         """
         pool, rng = self.pool, self.rng
         visits = Visits(np.zeros(0, np.float32), np.zeros(0), np.zeros(0))
-        observations, labels, weights = [], [], []
+        inputs, labels, weights = [], [], []
+        states: list[Mapping[str, Any]] = []
+        knows_all = isinstance(self.teacher, PlannerTeacher) and self.teacher.knows_all
         for _ in range(n_steps):
             stalled = self._stalled()
             visits.n_stalls += int(stalled.sum())
             label = self.teacher.label(pool.situation())
-            observations.append(pool.observations.copy())
+            inputs.append(pool.inputs)
             labels.append(label)
+            if knows_all:
+                states += [env.unwrapped.state for env in pool.envs]
             weights.append(np.where(stalled, STALL_WEIGHT, 1.0))
             for row in np.flatnonzero(self._left <= 0).tolist():
                 self._left[row], self._guided[row] = rng.integers(*_SEGMENT), rng.random() < share
             self._guided[stalled], self._left[stalled] = True, _RESCUE
             self._left -= 1
-            actions = label if student is None else np.array(student(pool.observations))
+            actions = label if student is None else np.array(student(pool.inputs))
             actions = np.where(self._guided.reshape(-1, *[1] * (label.ndim - 1)), label, actions)
             if student is None:
                 actions = self._disturbed(actions)
@@ -259,13 +281,15 @@ class Collector:
                 if ended or self._elapsed[row] >= self.limit:
                     visits.ended.append((bool(info.get("is_success", False)), int(self._elapsed[row])))
                     self._reset(row)
-        visits.observations, visits.actions = np.concatenate(observations), np.concatenate(labels)
+        visits.inputs, visits.actions = np.concatenate(inputs), np.concatenate(labels)
         visits.weights = np.concatenate(weights)
+        if isinstance(self.teacher, PlannerTeacher) and knows_all:
+            visits.good = self.teacher.good_actions(states)
         if self.augment is not None:
-            chosen = rng.random(len(visits.observations)) < 0.5
-            changed = self.augment(visits.observations[chosen], rng)
+            chosen = rng.random(len(visits.inputs)) < 0.5
+            changed = self.augment(visits.inputs[chosen], rng)
             labels = [visits.actions, self.teacher.label_alone(changed, pool.envs[0])]
-            visits.observations = np.concatenate([visits.observations, changed])
+            visits.inputs = np.concatenate([visits.inputs, changed])
             visits.actions, visits.weights = np.concatenate(labels), np.append(visits.weights, np.ones(len(changed)))
         return visits
 
@@ -282,8 +306,10 @@ class Collector:
         if not self._has_goal:
             return np.zeros(len(self.pool), dtype=bool)
         counts = []
-        for seen, state in zip(self._seen, np.round(self.pool.observations, 3), strict=True):
-            key = state.tobytes()
+        for seen, env, observation in zip(self._seen, self.pool.envs, self.pool.observations, strict=True):
+            # Where observations do not show all, states do.
+            state = getattr(env.unwrapped, "state", None)
+            key = repr(state) if isinstance(state, Mapping) else np.round(observation, 3).tobytes()
             seen[key] = seen.get(key, 0) + 1
             counts.append(seen[key])
         return np.array(counts) >= _STALLED

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, Union, cast
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from progpolicy_envs.vector import PlanningVectorEnv
+from sb3_progpolicy.analysis.situations import good_actions
 from sb3_progpolicy.interaction import interaction_space
 from sb3_progpolicy.programs.interpreter import ProgramRunner, join_inputs
 from sb3_progpolicy.programs.syntax import ProgramData
@@ -20,6 +23,7 @@ if TYPE_CHECKING:
 Observations = NDArray[np.floating]
 TeacherLike = Union[str, "BaseAlgorithm", ProgramData, Callable[[Observations], NDArray[Any]], "Teacher"]
 PLANNER = "planner"
+_STATES_AT_ONCE = 500
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,20 @@ class Situation:
     actions: NDArray[Any] | None
     rewards: NDArray[np.float32]
     dones: NDArray[np.bool_]
+
+
+def join_history(
+    observations: Observations,
+    actions: NDArray[Any] | None,
+    rewards: NDArray[np.float32],
+    dones: NDArray[np.bool_],
+    spec: ActionSpec,
+) -> NDArray[np.float32]:
+    """Return X = [observation, previous action, previous reward, previous done]; see :class:`Situation`."""
+    previous = np.zeros((len(observations), spec.history_size), dtype=np.float32)
+    if actions is not None:
+        previous = encode_actions(actions, spec)
+    return np.concatenate((observations, previous, rewards[:, None], dones[:, None]), axis=1, dtype=np.float32)
 
 
 class Teacher(Protocol):
@@ -59,9 +77,18 @@ class Teacher(Protocol):
 
 
 class PlannerTeacher:
-    """The first action of ``env.unwrapped.plan()``: a shortest solution, or the scripted controller of a Panda task."""
+    """The first action of ``env.unwrapped.plan()``: a shortest solution, or the scripted controller of a Panda task.
+
+    :param env: an environment of the domain
+    """
 
     name = PLANNER
+
+    def __init__(self, env: Any) -> None:
+        self._batch: PlanningVectorEnv | None = None
+        if env.spec is not None and env.spec.vector_entry_point is not None:
+            batch = gym.make_vec(env.spec.id, num_envs=1, vectorization_mode="vector_entry_point").unwrapped
+            self._batch = batch if isinstance(batch, PlanningVectorEnv) else None
 
     def begin(self) -> None:
         """See :meth:`Teacher.begin`."""
@@ -69,6 +96,20 @@ class PlannerTeacher:
     def label(self, situation: Situation) -> NDArray[Any]:
         """See :meth:`Teacher.label`."""
         return np.array([next(iter(env.unwrapped.plan())) for env in situation.envs])
+
+    def good_actions(self, states: Sequence[Mapping[str, Any]]) -> NDArray[np.bool_]:
+        """Return all actions that begin a shortest solution, ``(n_states, n_actions)``.
+
+        :param states: of a planning domain
+        """
+        assert self._batch is not None
+        parts = range(0, len(states), _STATES_AT_ONCE)
+        return np.concatenate([good_actions(states[at : at + _STATES_AT_ONCE], self._batch) for at in parts])
+
+    @property
+    def knows_all(self) -> bool:
+        """Whether :meth:`good_actions` is known: in a planning domain."""
+        return self._batch is not None
 
     def label_alone(self, observations: Observations, env: Any) -> NDArray[Any]:
         """Ask the scripted controller, where there is one. See :meth:`Teacher.label_alone`."""
@@ -178,12 +219,7 @@ class ModelTeacher:
             observations = cast(NDArray[Any], self.normalizer.normalize_obs(observations))
             rewards = self.normalizer.normalize_reward(rewards)
         if self.joins_history:
-            n_envs = len(observations)
-            previous = np.zeros((n_envs, self.spec.history_size), dtype=np.float32)
-            if situation.actions is not None:
-                previous = encode_actions(situation.actions, self.spec)
-            columns = (observations, previous, rewards[:, None], situation.dones[:, None])
-            observations = np.concatenate(columns, axis=1, dtype=np.float32)
+            observations = join_history(observations, situation.actions, rewards, situation.dones, self.spec)
         actions, self._state = self.model.predict(observations, self._state, situation.dones, deterministic=True)
         return actions
 
@@ -211,7 +247,7 @@ def make_teacher(teacher: TeacherLike, env: Any) -> Teacher:
 
             name = env.spec.id if env.spec else env
             raise ValueError(f"{name} has no planner; these have: {', '.join(DOMAINS)}")
-        return PlannerTeacher()
+        return PlannerTeacher(env)
     if hasattr(teacher, "predict") and hasattr(teacher, "get_vec_normalize_env"):
         return ModelTeacher(cast(Any, teacher), env.observation_space, action_spec(env.action_space))
     if callable(teacher):

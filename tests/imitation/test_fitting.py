@@ -140,7 +140,7 @@ def test_constant_and_forbidden_inputs_are_not_read():
 
 def test_program_acts_as_the_list(known):
     spec = ActionSpec("box", (2,), (-1.0, -1.0), (1.0, 1.0))
-    program = to_program(known, spec, tuple("abcde"), ("x", "y"), learned_by="imitation")
+    program = to_program(known, spec, tuple("abcde"), ("x", "y"), False, learned_by="imitation")
     inputs = data_of(known, n=200).inputs
     expected = np.clip(known.outputs(inputs), -1, 1)
     np.testing.assert_allclose(ProgramRunner(program, 200).act(inputs[:, :-1]), expected, atol=1e-6)

@@ -13,7 +13,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from progpolicy_envs.panda import PandaStackEnv
-from sb3_progpolicy import compare_with_teacher, imitate, load_pretrained
+from sb3_progpolicy import compare_with_teacher, evaluate_program, imitate, load_pretrained
 from sb3_progpolicy.cli import run
 from sb3_progpolicy.imitation import algorithm, make_teacher
 from sb3_progpolicy.imitation.algorithm import training_variations
@@ -223,6 +223,28 @@ def test_state_in_which_the_student_stands_still_weighs_more_and_the_teacher_tak
     assert visits.n_stalls > 0
     assert set(visits.weights.tolist()) == {1.0, STALL_WEIGHT}
     assert any(success for success, _ in visits.ended)
+
+
+def test_all_first_actions_of_shortest_solutions_are_labels():
+    pool = Pool("Stacking-v0", 4)
+    collector = Collector(
+        pool, make_teacher("planner", pool.envs[0]), *training_variations("Stacking-v0", None), seed=0
+    )
+    collector.begin()
+    visits = collector.collect(20, None, share=1.0)
+    assert visits.good.shape == (80, 5)
+    assert visits.good[np.arange(80), visits.actions].all()
+    assert (visits.good.sum(axis=1) == 2).any()
+
+
+def test_program_may_read_its_previous_action():
+    program = imitate("planner", "Hanoi-v0", tasks=[{"n_discs": 1}], interaction=True, **SMALL)
+    assert program.interaction
+    assert program.input_names[-2:] == ("previous reward", "previous done")
+    (row,) = evaluate_program(program, "Hanoi-v0", [{"n_discs": 1}], n_episodes=5)
+    assert row.success_rate == 1
+    compared = compare_with_teacher("planner", program, "Hanoi-v0", [{"n_discs": 1}], n_episodes=4)
+    assert compared.program["success"] == 1
 
 
 def test_each_size_is_drawn_twice_as_often_as_the_one_before():
