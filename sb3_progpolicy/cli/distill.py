@@ -99,7 +99,9 @@ def _imitated(teacher: Any, env_id: str, output: Path | None, arguments: dict[st
         bar = progress.add_task(f"Imitating on {env_id}", total=None)
 
         def show(so_far: Imitation) -> None:
-            words = f"{so_far.n_states} states, score {so_far.score:.3g} (teacher {so_far.teacher_score:.3g})"
+            name = next(iter(so_far.teacher))
+            reached = f"{so_far.result[name]:.3g}" if name in so_far.result else "-"
+            words = f"{so_far.n_states} states, {name} {reached} (teacher {so_far.teacher[name]:.3g})"
             progress.update(bar, completed=so_far.round, total=so_far.n_rounds, description=words)
             if output is not None:
                 so_far.program.save(output)

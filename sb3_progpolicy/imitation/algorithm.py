@@ -25,6 +25,7 @@ from sb3_progpolicy.spaces import action_spec
 TEACHER_SHARES = (1.0, 0.6, 0.4, 0.3, 0.2, 0.1)
 N_ROUNDS, N_SPARSE_ROUNDS = 9, 2
 _TOLERANCES = (0.012, 0.006, 0.003, 0.0015)  # of the mean loss, the sparsest program first
+_FINALISTS = 3
 _DIGITS = (2, 3, 4, 6)
 #: Inputs that are not read by default: beyond the training sizes they take values that were never seen.
 IGNORED = ("left",)
@@ -38,16 +39,16 @@ class Imitation:
     :param round: rounds that are done
     :param n_rounds: rounds in all
     :param n_states: labelled states so far
-    :param score: of the best program: share of successes less a little for its steps, or its mean return
-    :param teacher_score: the teacher's
+    :param result: of the best program in its validation: success, if there is a goal, steps and return
+    :param teacher: the teacher's
     :param program: the best so far
     """
 
     round: int
     n_rounds: int
     n_states: int
-    score: float
-    teacher_score: float
+    result: Mapping[str, float]
+    teacher: Mapping[str, float]
     program: Program
 
 
@@ -63,7 +64,7 @@ def imitate(
     n_envs: int = 24,
     interaction: bool = False,
     ignore: Sequence[str] = IGNORED,
-    score_tolerance: float = 0.01,
+    score_tolerance: float = 0.015,
     n_episodes: int = 24,
     env_kwargs: Mapping[str, Any] | None = None,
     augment: str | Augment | None = None,
@@ -93,7 +94,7 @@ def imitate(
     :param interaction: whether the program reads its previous action, reward and done flag, too
     :param ignore: names of inputs that the program must not read
     :param score_tolerance: share of the score that fewer and rounder numbers may cost
-    :param n_episodes: of each validation, on training variations
+    :param n_episodes: of each validation, on training variations; the last ones have three times as many
     :param env_kwargs: constructor arguments of the environment
     :param augment: makes states that were not visited, which the teacher labels too: a function from observations and
         a generator to observations, or ``"taller_towers"`` for PandaStack. What was learned so was shown more than the
@@ -117,6 +118,9 @@ def imitate(
         return run.run(n_timesteps // (n_shares * n_envs), callback, checkpoint)
     finally:
         pool.close()
+
+
+Scored = tuple[float, DecisionList]
 
 
 class _Run:
@@ -145,7 +149,8 @@ class _Run:
         self.variations, ranks = training_variations(env_id, tasks)
         largest = max(ranks)
         # The smaller sizes are the ends of the larger ones, which therefore say more.
-        self.validation = [one for one, rank in zip(self.variations, ranks, strict=True) if rank >= largest - 1]
+        ranked = list(zip(self.variations, ranks, strict=True))
+        self.validation = [one for least in (largest - 1, largest) for one, rank in ranked if rank >= least]
         augmentation = make_augmentation(augment, self.inputs)
         self.collector = Collector(pool, self.teacher, self.variations, ranks, seed, augmentation)
         self.origin: dict[str, Any] = {"env": env_id, "seed": seed, "teacher": self.teacher.name}
@@ -153,7 +158,11 @@ class _Run:
             self.origin["augment"] = augment if isinstance(augment, str) else getattr(augment, "__name__", "function")
         readable = np.array([name not in ignore for name in self.inputs])
         self.learner = Learner(self.codec, readable, Settings(max_branches, seed))
-        self.best: tuple[float, DecisionList] | None = None
+        self.best: Scored | None = None
+        self.runners_up: list[Scored] = []
+        self.final = False
+        self.result: dict[str, float] = {}
+        self.last_result: dict[str, float] = {}
         self.teacher_episodes: Episodes | None = None
 
     def run(self, n_steps: int, callback: Callable[[Imitation], None] | None, checkpoint: Path | None) -> Program:
@@ -163,6 +172,8 @@ class _Run:
         if checkpoint is not None and checkpoint.exists():
             first, self.best, self.collector.next_seed = load_state(checkpoint, origin, self.learner)
             self.collector.rng = np.random.default_rng((self.seed, first))
+            self.runners_up = [self.best] if self.best is not None else []
+        self.final = first >= N_ROUNDS
         self.teacher_episodes = play(self.pool, self.validation, self.n_episodes, VALIDATION_SEED, None, self.teacher)
         self._limit_episodes()
         self.collector.begin()
@@ -190,9 +201,17 @@ class _Run:
         if number == N_ROUNDS - 1:
             for candidate in learner.finish():
                 self._offer(candidate)
+            self._choose_finally()
             self._make_sparse()
             return
         self._offer(learner.refit_sparse(), sparse=True)
+
+    def _choose_finally(self) -> None:
+        """Let the best few play more episodes, which none of them was chosen by."""
+        self.final = True
+        self.best = None
+        for _, candidate in list(self.runners_up):
+            self._offer(candidate)
 
     def _make_sparse(self) -> None:
         """Go on with the program of fewest inputs whose episodes are as good as the best ones."""
@@ -202,15 +221,16 @@ class _Run:
             sparse = self.learner.sparse(dense, tolerance)
             reached = self._score(sparse)
             if self._as_good(reached, score):
-                self.best, self.learner.raw = (reached, sparse), sparse
+                self.best, self.learner.raw, self.result = (reached, sparse), sparse, self.last_result
                 return
         self.learner.raw = dense
 
     def _offer(self, candidate: DecisionList, sparse: bool = False) -> None:
         """Keep a candidate if its episodes are better than the best so far."""
         reached = self._score(candidate)
+        self.runners_up = sorted([*self.runners_up, (reached, candidate)], key=lambda scored: -scored[0])[:_FINALISTS]
         if self.best is None or reached >= self.best[0] or (sparse and self._as_good(reached, self.best[0])):
-            self.best = (reached, candidate)
+            self.best, self.result = (reached, candidate), self.last_result
 
     def _rounded(self) -> DecisionList:
         """Return the best list with as few digits as its episodes allow, its outputs in the unit of actions."""
@@ -228,14 +248,23 @@ class _Run:
         return reached >= score - share * self.score_tolerance * max(1.0, abs(score))
 
     def _score(self, raw: DecisionList) -> float:
-        return self._play(self._act(raw)).score
+        return self._play(self._act(raw)).score(self._teacher_steps)
 
     def _program_score(self, program: Program) -> float:
-        return self._play(program_act(program, len(self.pool))).score
+        return self._play(program_act(program, len(self.pool))).score(self._teacher_steps)
+
+    @property
+    def _teacher_steps(self) -> float:
+        assert self.teacher_episodes is not None
+        return float(self.teacher_episodes.steps.mean())
 
     def _play(self, act: Any) -> Episodes:
-        episodes = play(self.pool, self.validation, self.n_episodes, VALIDATION_SEED, act)
+        seed, n_episodes = VALIDATION_SEED, self.n_episodes
+        if self.final:
+            seed, n_episodes = seed + n_episodes, 3 * n_episodes
+        episodes = play(self.pool, self.validation, n_episodes, seed, act)
         self.collector.begin()
+        self.last_result = episodes.summary()
         return episodes
 
     def _act(self, raw: DecisionList) -> Any:
@@ -254,10 +283,15 @@ class _Run:
     def _progress(self, number: int, total: int) -> Imitation:
         assert self.teacher_episodes is not None
         assert self.learner.raw is not None
-        score, raw = self.best if self.best is not None else (float("nan"), self.learner.raw)
+        raw = self.learner.raw if self.best is None else self.best[1]
         in_units = DecisionList(raw.conditions, self.codec.to_action_units(raw.controllers))
         return Imitation(
-            number, total, self.learner.n_states, score, self.teacher_episodes.score, self._program(in_units)
+            number,
+            total,
+            self.learner.n_states,
+            self.result,
+            self.teacher_episodes.summary(),
+            self._program(in_units),
         )
 
     def _program(self, raw: DecisionList) -> Program:

@@ -23,6 +23,7 @@ _SEGMENT = (5, 40)  # steps for which teacher or student act in turn
 _STALLED = 3  # visits of the same state that make a stall
 _RESCUE = 10  # steps of the teacher out of one
 STALL_WEIGHT = 3.0
+_STEPS_COUNT = 0.1  # a tenth more steps than the teacher's are as bad as one failure in a hundred
 _NOISE = 0.15  # of the first round, in which only the teacher acts
 
 
@@ -100,11 +101,13 @@ class Episodes:
     successes: NDArray[np.bool_]
     distance: float = float("nan")
 
-    @property
-    def score(self) -> float:
-        """What is better if larger: the share of successes, then few steps; or the mean return."""
+    def score(self, steps: float) -> float:
+        """Return what is better if larger: the share of successes, less a tenth of the steps taken; or the mean return.
+
+        :param steps: the unit of steps, such as those of a teacher
+        """
         if len(self.successes):
-            return float(self.successes.mean() - self.steps.mean() / 1e5)
+            return float(self.successes.mean() - _STEPS_COUNT * self.steps.mean() / max(steps, 1.0))
         return float(self.returns.mean())
 
     def summary(self) -> dict[str, float]:
