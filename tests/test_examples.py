@@ -55,3 +55,16 @@ def test_demo_prints_a_table_and_writes_program_picture_and_film(tmp_path):
     assert load_program(folder / "program.json").metadata["env"] == "Hanoi-v0"
     assert (folder / "program.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "hanoi.gif").read_bytes().startswith(b"GIF89a")
+
+
+def test_distilled_network_is_printed_and_exported(tmp_path):
+    output = run("distill_sb3_model.py", tmp_path, "--states", "1000")
+    assert "Program for CartPole-v1" in output
+    assert "of the actions are the same" in output
+    assert (tmp_path / "policy.py").exists()
+
+
+def test_distilled_planner_is_compared_with_it(tmp_path):
+    output = run("distill_planner.py", tmp_path, "--env", "Stacking-v0", "--max-conditions", "0")
+    assert "round 11 of 11" in output
+    assert "success: planner 1.00" in output
