@@ -24,7 +24,8 @@ from sb3_progpolicy.spaces import action_spec
 #: Share of the teacher in each round; 0 in all later ones.
 TEACHER_SHARES = (1.0, 0.6, 0.4, 0.3, 0.2, 0.1)
 N_ROUNDS, N_SPARSE_ROUNDS = 9, 2
-_TOLERANCES = (0.012, 0.006, 0.003, 0.0015)  # of the mean loss, the sparsest program first
+# Of the mean loss, and whether few inputs matter more; the sparsest program first.
+_TOLERANCES = ((0.012, True), (0.006, True), (0.003, True), (0.003, False), (0.001, False))
 _FINALISTS = 3
 _DIGITS = (2, 3, 4, 6)
 #: Inputs that are not read by default: beyond the training sizes they take values that were never seen.
@@ -217,8 +218,8 @@ class _Run:
         """Go on with the program of fewest inputs whose episodes are as good as the best ones."""
         assert self.best is not None
         score, dense = self.best
-        for tolerance in _TOLERANCES:
-            sparse = self.learner.sparse(dense, tolerance)
+        for tolerance, always_few in _TOLERANCES:
+            sparse = self.learner.sparse(dense, tolerance, always_few)
             reached = self._score(sparse)
             if self._as_good(reached, score):
                 self.best, self.learner.raw, self.result = (reached, sparse), sparse, self.last_result

@@ -9,7 +9,8 @@ import numpy as np
 from sb3_progpolicy.imitation.decision_list import Floats
 from sb3_progpolicy.imitation.losses import eliminate
 
-_SUPPORTS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 22)
+_SHARPNESS = 4.0  # of a condition whose values have a deviation of 1, taken for a logistic regression
+_SUPPORTS = (1, 2, 3, 4, 5, 6, 8, 10)
 
 
 def fit_condition(
@@ -53,31 +54,84 @@ def fit_condition(
     return best / max(float(np.std(inputs @ best)), 1e-9), value
 
 
-def fit_sparse_condition(inputs: Floats, gains: Floats, start: Floats, tolerance: float) -> Floats:
+def fit_sparse_condition(
+    inputs: Floats, gains: Floats, start: Floats, tolerance: float, always_few: bool = False
+) -> Floats:
     """Return the condition of fewest inputs whose sum of gains is at most ``tolerance`` below the best known.
 
     :param inputs: ``(n, width)``
     :param gains: ``(n,)``
     :param start: a condition that is known
     :param tolerance: in the unit of the gains
+    :param always_few: whether to return the best one of at most ten inputs if none is within the tolerance
     """
     full, value = fit_condition(inputs, gains, start, ridges=(1e-3,))
     if full is None:
         return start
-    wanted, width = gains > 0, inputs.shape[1]
     costs = np.abs(gains) / np.abs(gains).mean()
-    direction = logistic(inputs, wanted, costs, None, 1e-4)
+    paths = [
+        _elimination(inputs, costs, direction)
+        for direction in (logistic(inputs, gains > 0, costs, None, 1e-4), _SHARPNESS * full)
+    ]
+    best, most = full, -np.inf
+    for size in _SUPPORTS:
+        for path in paths:
+            kept, adjusted = next(step for step in path if step[0].sum() <= size + 1)
+            part = inputs[:, kept]
+            fewer, _ = fit_condition(part, gains, adjusted[kept], ridges=(1e-3, 1e-5), cautions=(1.0, 2.0))
+            if fewer is None:
+                continue
+            fewer, reached = improve(part, gains, fewer)
+            if reached > most:
+                best, most = np.zeros(len(kept)), reached
+                best[kept] = fewer
+            if reached >= value - tolerance:
+                return best
+    return best if always_few else full
+
+
+def _elimination(inputs: Floats, costs: Floats, direction: Floats) -> list[tuple[np.ndarray, Floats]]:
+    """Return the masks and weights of :func:`eliminate` for a logistic regression."""
     chances = _sigmoid(inputs @ direction)
     curvature = costs * np.maximum(chances * (1 - chances), 1e-3)
-    supports = eliminate((inputs * curvature[:, None]).T @ inputs + 1e-5 * len(inputs) * np.eye(width), direction)
-    for size in _SUPPORTS:
-        support = next(kept for kept in supports if kept.sum() <= size + 1)
-        fewer, fewer_value = fit_condition(inputs[:, support], gains, ridges=(1e-3, 1e-5), cautions=(1.0, 2.0))
-        if fewer is not None and fewer_value >= value - tolerance:
-            sparse = np.zeros(width)
-            sparse[support] = fewer
-            return sparse
-    return full
+    hessian = (inputs * curvature[:, None]).T @ inputs + 1e-5 * len(inputs) * np.eye(len(direction))
+    return eliminate(hessian, direction)
+
+
+def improve(inputs: Floats, gains: Floats, condition: Floats, cycles: int = 2) -> tuple[Floats, float]:
+    """Return a condition of no smaller sum of gains, one weight after another at its best (OC1, Murthy et al. 1994).
+
+    :param inputs: ``(n, width)``
+    :param gains: ``(n,)``
+    :param condition: to begin with
+    :param cycles: over the weights
+    :return: the condition, and the sum of gains where it holds
+    """
+    condition = condition / max(float(np.std(inputs @ condition)), 1e-9)
+    values = inputs @ condition
+    best = float(gains[values >= 0].sum())
+    for _ in range(cycles):
+        before = best
+        for index in range(len(condition)):
+            column = inputs[:, index]
+            moves = np.abs(column) > 1e-9
+            # The weight at which each state begins to hold, where its input is positive, or ceases to.
+            turns = condition[index] - values[moves] / column[moves]
+            order = np.argsort(turns, kind="stable")
+            turns, signs = turns[order], np.sign(column[moves][order])
+            moved = gains[moves][order]
+            sums = moved[signs < 0].sum() + np.cumsum(signs * moved) + gains[~moves & (values >= 0)].sum()
+            last = int(sums[:-1].argmax()) if len(sums) > 1 else 0
+            if len(sums) > 1 and sums[last] > best + 1e-9:
+                weight = 0.5 * (turns[last] + turns[last + 1])
+                shifted = values + (weight - condition[index]) * column
+                reached = float(gains[shifted >= 0].sum())
+                if reached > best:
+                    condition = condition.copy()
+                    condition[index], values, best = weight, shifted, reached
+        if best <= before:
+            break
+    return condition, best
 
 
 def logistic(

@@ -226,13 +226,16 @@ def drop_branches(loss: Loss, program: DecisionList, data: Data, price: float = 
     return program
 
 
-def sparsify(loss: Loss, program: DecisionList, data: Data, tolerance: float, sweeps: int = 2) -> DecisionList:
+def sparsify(
+    loss: Loss, program: DecisionList, data: Data, tolerance: float, always_few: bool = False, sweeps: int = 2
+) -> DecisionList:
     """Return the list with the smallest support of each condition and output within a tolerance of the mean loss.
 
     :param loss: of the action space
     :param program: to begin with
     :param data: labelled states
     :param tolerance: by which the loss of an output may grow in its branch; a condition may cost 0.3 of that
+    :param always_few: whether few inputs matter more than the tolerance
     :param sweeps: over the list
     """
     conditions, controllers = program.conditions.copy(), program.controllers.copy()
@@ -244,7 +247,7 @@ def sparsify(loss: Loss, program: DecisionList, data: Data, tolerance: float, sw
             if here.sum() > 40:
                 # A branch of few states may be less exact.
                 allowed = tolerance * max(1.0, 0.02 * n / here.sum())
-                controllers[index] = loss.fit_sparse(data.take(here), controllers[index], allowed)
+                controllers[index] = loss.fit_sparse(data.take(here), controllers[index], allowed, always_few)
         losses = loss.matrix(data, controllers)
         holds = data.inputs @ conditions.T >= 0
         rest = losses[:, -1]
@@ -253,7 +256,9 @@ def sparsify(loss: Loss, program: DecisionList, data: Data, tolerance: float, sw
             here = ~holds[:, :index].any(axis=1) & (np.abs(gains) > _LEAST)
             if here.sum() > 20:
                 allowed = 0.3 * tolerance * data.weights.sum()
-                conditions[index] = fit_sparse_condition(data.inputs[here], gains[here], conditions[index], allowed)
+                conditions[index] = fit_sparse_condition(
+                    data.inputs[here], gains[here], conditions[index], allowed, always_few
+                )
             holds[:, index] = data.inputs @ conditions[index] >= 0
             rest = np.where(holds[:, index], losses[:, index], rest)
     return drop_branches(loss, DecisionList(conditions, controllers), data, price=0.1 * tolerance)

@@ -89,14 +89,15 @@ class Learner:
         present = self._polished(self._scaled(self.raw, scaler), data, 0.1, self.settings.final_steps)
         return self._chosen([present], data, scaler)
 
-    def sparse(self, raw: DecisionList, tolerance: float) -> DecisionList:
+    def sparse(self, raw: DecisionList, tolerance: float, always_few: bool) -> DecisionList:
         """Return a list with few inputs, fitted again with these alone.
 
         :param raw: on raw observations
         :param tolerance: see :func:`~sb3_progpolicy.imitation.fitting.sparsify`
+        :param always_few: see there
         """
         scaler, data = self._prepared()
-        sparse = sparsify(self.loss, self._scaled(raw, scaler), self._some(data, _MANY), tolerance)
+        sparse = sparsify(self.loss, self._scaled(raw, scaler), self._some(data, _MANY), tolerance, always_few)
         return self._refitted(sparse, data, scaler, self.settings.final_steps)
 
     def refit_sparse(self) -> DecisionList:

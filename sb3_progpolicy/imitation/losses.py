@@ -16,7 +16,7 @@ _DELTA = 0.1  # Huber's: errors beyond it count by their size, not its square
 _SATURATED = 0.999
 _OVERSHOOT = 0.15  # weight of too much along a direction that the teacher has shortened to fit into the bounds
 _MAX_NATS = 3.0  # a wrong decision costs no more than this, however sure it is
-_SUPPORTS = (0, 1, 2, 3, 4, 6, 8, 12, 16)
+_SUPPORTS = (0, 1, 2, 3, 4, 6, 8, 12)
 
 
 class Loss(Protocol):
@@ -28,8 +28,11 @@ class Loss(Protocol):
     def fit(self, data: Data, start: Floats | None = None, iterations: int = 8, ridge: float = 1e-4) -> Floats:
         """Return the controller of the least weighted loss, ``(n_outputs, n_inputs + 1)``."""
 
-    def fit_sparse(self, data: Data, start: Floats, tolerance: float) -> Floats:
-        """Return the controller of fewest inputs whose mean loss is at most ``tolerance`` above the least."""
+    def fit_sparse(self, data: Data, start: Floats, tolerance: float, always_few: bool = False) -> Floats:
+        """Return the controller of fewest inputs whose mean loss is at most ``tolerance`` above the least.
+
+        With ``always_few`` it is one of few inputs even if none is within the tolerance.
+        """
 
     def expected(self, outputs: th.Tensor, targets: th.Tensor) -> th.Tensor:
         """Return the loss of outputs ``(n, n_controllers, n_outputs)`` against ``(n, n_outputs)``, differentiable."""
@@ -96,7 +99,7 @@ class BoxLoss:
                 )
         return controller
 
-    def fit_sparse(self, data: Data, start: Floats, tolerance: float) -> Floats:
+    def fit_sparse(self, data: Data, start: Floats, tolerance: float, always_few: bool = False) -> Floats:
         """Return each output with the fewest inputs, by backward elimination. See :meth:`Loss.fit_sparse`."""
         full = self.fit(data, start, iterations=4, ridge=1e-5)
         slack, width = self._slack(data.targets), data.inputs.shape[1]
@@ -106,11 +109,14 @@ class BoxLoss:
             hessian = (data.inputs * weights[:, None]).T @ data.inputs / _DELTA + 1e-5 * len(data) * np.eye(width)
             supports = eliminate(hessian, full[output])
             limit = self._one(data, full[output], output, slack) + tolerance
+            least = np.inf
             for size in _SUPPORTS:
-                support = next(kept for kept in supports if kept.sum() <= size + 1)
+                support = next(kept for kept, _ in supports if kept.sum() <= size + 1)
                 row = self._fit_support(data, output, support, slack)
-                if self._one(data, row, output, slack) <= limit:
-                    sparse[output] = row
+                reached = self._one(data, row, output, slack)
+                if reached <= limit or (always_few and reached < least):
+                    sparse[output], least = row, reached
+                if reached <= limit:
                     break
         return sparse
 
@@ -188,7 +194,7 @@ class DiscreteLoss:
         start = np.zeros(shape) if start is None else start
         return self._fit_support(data, start, np.ones(shape, dtype=bool), 6 * iterations, ridge)
 
-    def fit_sparse(self, data: Data, start: Floats, tolerance: float) -> Floats:
+    def fit_sparse(self, data: Data, start: Floats, tolerance: float, always_few: bool = False) -> Floats:
         """Leave out the smallest weights again and again. See :meth:`Loss.fit_sparse`."""
         best = self.fit(data, start, iterations=10)
         support = np.ones(best.shape, dtype=bool)
@@ -241,7 +247,7 @@ class DiscreteLoss:
         return controller
 
 
-def eliminate(hessian: Floats, weights: Floats) -> list[np.ndarray]:
+def eliminate(hessian: Floats, weights: Floats) -> list[tuple[np.ndarray, Floats]]:
     """Return which inputs are left when they are taken out one by one, the least needed first; the constant stays.
 
     This is the optimal brain surgeon (Hassibi and Stork 1993): the one to go next costs the least of a quadratic loss
@@ -249,10 +255,10 @@ def eliminate(hessian: Floats, weights: Floats) -> list[np.ndarray]:
 
     :param hessian: of the loss, ``(width, width)``, the constant last
     :param weights: at its least, ``(width,)``
-    :return: masks ``(width,)`` from all to the constant alone
+    :return: masks ``(width,)`` from all to the constant alone, each with the adjusted weights
     """
     kept, inverse, weights = np.ones(len(weights), dtype=bool), np.linalg.inv(hessian), weights.copy()
-    masks = [kept.copy()]
+    steps = [(kept.copy(), weights)]
     while kept[:-1].any():
         costs = np.where(kept, weights**2 / np.maximum(np.diag(inverse), 1e-300), np.inf)
         costs[-1] = np.inf
@@ -260,5 +266,5 @@ def eliminate(hessian: Floats, weights: Floats) -> list[np.ndarray]:
         weights = weights - weights[least] / inverse[least, least] * inverse[:, least]
         inverse = inverse - np.outer(inverse[:, least], inverse[least]) / inverse[least, least]
         kept[least], weights[least] = False, 0.0
-        masks.append(kept.copy())
-    return masks
+        steps.append((kept.copy(), weights.copy()))
+    return steps

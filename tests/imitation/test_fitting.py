@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sb3_progpolicy.imitation.conditions import fit_condition, fit_sparse_condition
+from sb3_progpolicy.imitation.conditions import fit_condition, fit_sparse_condition, improve
 from sb3_progpolicy.imitation.conversion import rounded, significant, to_program
 from sb3_progpolicy.imitation.decision_list import Data, DecisionList, Scaler
 from sb3_progpolicy.imitation.fitting import alternate, drop_branches, fit_planes, grow, sparsify
@@ -105,8 +105,18 @@ def test_condition_holds_where_there_is_something_to_gain():
     assert fit_condition(inputs, -np.ones(1000))[0] is None
 
 
+def test_condition_is_improved_by_its_true_gain():
+    rng = np.random.default_rng(0)
+    inputs = np.column_stack([rng.normal(size=(2000, 3)), np.ones(2000)])
+    true = np.array([1.0, -0.7, 0.0, 0.3])
+    gains = np.where(inputs @ true > 0, 1.0, -1.0)
+    start = np.array([1.0, 0.2, 0.3, -0.2])
+    condition, value = improve(inputs, gains, start, cycles=20)
+    assert value == gains[inputs @ condition >= 0].sum() > 0.99 * gains[gains > 0].sum()
+
+
 def test_needed_input_is_eliminated_last():
-    masks = eliminate(np.eye(4), np.array([0.1, 2.0, 0.5, 9.0]))
+    masks, _ = zip(*eliminate(np.eye(4), np.array([0.1, 2.0, 0.5, 9.0])), strict=True)
     assert [mask[:-1].tolist() for mask in masks[1:3]] == [[False, True, True], [False, True, False]]
     assert all(mask[-1] for mask in masks)
 
