@@ -27,6 +27,7 @@ N_ROUNDS, N_SPARSE_ROUNDS = 9, 2
 # Of the mean loss, and whether few inputs matter more; the sparsest program first.
 _TOLERANCES = ((0.012, True), (0.006, True), (0.003, True), (0.003, False), (0.001, False))
 _FINALISTS = 3
+_SHORT = (1, 2, 4, 7)  # numbers of branches that are tried at the end
 _DIGITS = (2, 3, 4, 6)
 #: Inputs that are not read by default: beyond the training sizes they take values that were never seen.
 IGNORED = ("left",)
@@ -203,6 +204,7 @@ class _Run:
             for candidate in learner.finish():
                 self._offer(candidate)
             self._choose_finally()
+            self._make_short()
             self._make_sparse()
             return
         self._offer(learner.refit_sparse(), sparse=True)
@@ -213,6 +215,17 @@ class _Run:
         self.best = None
         for _, candidate in list(self.runners_up):
             self._offer(candidate)
+
+    def _make_short(self) -> None:
+        """Go on with a list of fewer branches if its episodes are as good as the best ones."""
+        assert self.best is not None
+        score, best = self.best
+        for n_branches in (number for number in _SHORT if number < best.n_branches):
+            short = self.learner.short(n_branches)
+            reached = self._score(short)
+            if self._as_good(reached, score):
+                self.best, self.result = (reached, short), self.last_result
+                return
 
     def _make_sparse(self) -> None:
         """Go on with the program of fewest inputs whose episodes are as good as the best ones."""

@@ -71,15 +71,14 @@ class Learner:
         :return: the new present list and those that are nearly as good, on raw observations
         """
         scaler, data = self._prepared()
-        candidates = []
+        candidates, most = [], self.settings.max_branches
         if self.raw is not None:
             present = self._scaled(self.raw, scaler)
-            if present.n_branches < self.settings.max_branches:
-                few = self._some(data, _FEW)
-                present = grow(self.loss, few, self.settings.max_branches, self.rng, present, tries=8)
+            if present.n_branches < most:
+                present = grow(self.loss, self._some(data, _FEW), most, self.rng, present, tries=8)
             candidates.append(self._polished(present, data, 0.1))
         if self.raw is None or number % _REFIT_EVERY == 0:
-            candidates += [self._polished(program, data, 0.3) for program in self._fresh(data)]
+            candidates += [self._polished(program, data, 0.3) for program in self._fresh(data, most)]
         return self._chosen(candidates, data, scaler)
 
     def finish(self) -> list[DecisionList]:
@@ -88,6 +87,13 @@ class Learner:
         scaler, data = self._prepared()
         present = self._polished(self._scaled(self.raw, scaler), data, 0.1, self.settings.final_steps)
         return self._chosen([present], data, scaler)
+
+    def short(self, n_branches: int) -> DecisionList:
+        """Return a list of at most so many branches, fitted from nothing, on raw observations."""
+        scaler, data = self._prepared()
+        fresh = self._fresh(data, n_branches)
+        polished = [self._polished(program, data, 0.3, self.settings.final_steps) for program in fresh]
+        return _raw(min(polished, key=lambda program: mean_loss(self.loss, program, data)), scaler)
 
     def sparse(self, raw: DecisionList, tolerance: float, always_few: bool) -> DecisionList:
         """Return a list with few inputs, fitted again with these alone.
@@ -125,9 +131,9 @@ class Learner:
             return data
         return data.take(self.rng.choice(len(data), size, replace=False))
 
-    def _fresh(self, data: Data) -> list[DecisionList]:
-        """Return a list that was grown, and the best of some fits by planes."""
-        few, most = self._some(data, _FEW), self.settings.max_branches
+    def _fresh(self, data: Data, most: int) -> list[DecisionList]:
+        """Return a list of at most so many branches that was grown, and the best of some fits by planes."""
+        few = self._some(data, _FEW)
         grown = grow(self.loss, few, most, self.rng)
         if most == 1:
             return [grown]
