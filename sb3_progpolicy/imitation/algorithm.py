@@ -27,6 +27,8 @@ N_ROUNDS, N_SPARSE_ROUNDS = 9, 2
 # Of the mean loss, and whether few inputs matter more; the sparsest program first.
 _TOLERANCES = ((0.012, True), (0.006, True), (0.003, True), (0.003, False), (0.001, False))
 _FINALISTS = 3
+_CHANGED = 0.02  # share of the actions, or mean distance, that rounding may change
+_HOPELESS = 6.0  # times the tolerance below what is needed
 _SHORT = (1, 2, 4, 7)  # numbers of branches that are tried at the end
 _DIGITS = (2, 3, 4, 6)
 #: Inputs that are not read by default: beyond the training sizes they take values that were never seen.
@@ -222,7 +224,9 @@ class _Run:
         score, best = self.best
         for n_branches in (number for number in _SHORT if number < best.n_branches):
             short = self.learner.short(n_branches)
-            reached = self._score(short)
+            if not self.learner.is_near(short, best):
+                continue
+            reached = self._score(short, score)
             if self._as_good(reached, score):
                 self.best, self.result = (reached, short), self.last_result
                 return
@@ -233,7 +237,7 @@ class _Run:
         score, dense = self.best
         for tolerance, always_few in _TOLERANCES:
             sparse = self.learner.sparse(dense, tolerance, always_few)
-            reached = self._score(sparse)
+            reached = self._score(sparse, score)
             if self._as_good(reached, score):
                 self.best, self.learner.raw, self.result = (reached, sparse), sparse, self.last_result
                 return
@@ -251,35 +255,43 @@ class _Run:
         assert self.best is not None
         score, best = self.best
         raw = DecisionList(best.conditions, self.codec.to_action_units(best.controllers))
+        states = self.learner.observations[:: max(1, self.learner.n_states // 2000)]
+        exact = self._act(best)(states)
         for digits in _DIGITS:
             candidate = rounded(raw, digits, self.codec.unit)
             program = self._program(candidate)
-            if self._as_good(self._program_score(program), score, share=0.5):
+            changed = self.codec.distance(program_act(program, len(states))(states), exact).mean()
+            if changed <= _CHANGED and self._as_good(self._program_score(program, score), score, share=0.5):
                 return candidate
         return raw
 
     def _as_good(self, reached: float, score: float, share: float = 1.0) -> bool:
         return reached >= score - share * self.score_tolerance * max(1.0, abs(score))
 
-    def _score(self, raw: DecisionList) -> float:
-        return self._play(self._act(raw)).score(self._teacher_steps)
+    def _score(self, raw: DecisionList, needed: float | None = None) -> float:
+        return self._play(self._act(raw), needed)
 
-    def _program_score(self, program: Program) -> float:
-        return self._play(program_act(program, len(self.pool))).score(self._teacher_steps)
+    def _program_score(self, program: Program, needed: float) -> float:
+        return self._play(program_act(program, len(self.pool)), needed)
 
     @property
     def _teacher_steps(self) -> float:
         assert self.teacher_episodes is not None
         return float(self.teacher_episodes.steps.mean())
 
-    def _play(self, act: Any) -> Episodes:
+    def _play(self, act: Any, needed: float | None = None) -> float:
+        """Return the score in validation episodes; if the first third is far from what is needed, that of these."""
         seed, n_episodes = VALIDATION_SEED, self.n_episodes
         if self.final:
-            seed, n_episodes = seed + n_episodes, 3 * n_episodes
+            seed += n_episodes
         episodes = play(self.pool, self.validation, n_episodes, seed, act)
+        score = episodes.score(self._teacher_steps)
+        if self.final and (needed is None or self._as_good(score, needed, share=_HOPELESS)):
+            episodes = play(self.pool, self.validation, 3 * n_episodes, seed, act)
+            score = episodes.score(self._teacher_steps)
         self.collector.begin()
         self.last_result = episodes.summary()
-        return episodes
+        return score
 
     def _act(self, raw: DecisionList) -> Any:
         def act(inputs: np.ndarray) -> np.ndarray:

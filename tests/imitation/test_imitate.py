@@ -47,7 +47,7 @@ def test_program_balances_as_its_teacher_does(balanced):
     compared = compare_with_teacher(balance, balanced, "CartPole-v1", n_episodes=8)
     assert compared.teacher["return"] == 500
     assert compared.program["return"] >= 490
-    assert compared.distance < 0.2
+    assert compared.distance < 0.3
 
 
 def test_program_says_how_it_was_learned(balanced, tmp_path):
