@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from sb3_progpolicy.callbacks import InteractionEvalCallback
     from sb3_progpolicy.evaluation import Evaluation, evaluate_model, evaluate_program
     from sb3_progpolicy.extraction import extract_program, holds_program
+    from sb3_progpolicy.imitation import compare_with_teacher, imitate
     from sb3_progpolicy.interaction import InteractionHistory, VecInteractionHistory
     from sb3_progpolicy.policies import ProgrammaticPolicy, RecurrentProgrammaticPolicy
     from sb3_progpolicy.pretrained import load_pretrained, pretrained_names
@@ -41,10 +42,12 @@ _MODULES = {
     "TaskDistribution": "reptile",
     "VecInteractionHistory": "interaction",
     "Verification": "analysis.verify",
+    "compare_with_teacher": "imitation",
     "evaluate_model": "evaluation",
     "evaluate_program": "evaluation",
     "extract_program": "extraction",
     "holds_program": "extraction",
+    "imitate": "imitation",
     "load_last_good": "reptile",
     "load_pretrained": "pretrained",
     "make_fast_vec_env": "vec_env",
@@ -72,10 +75,12 @@ __all__ = [
     "TaskDistribution",
     "VecInteractionHistory",
     "Verification",
+    "compare_with_teacher",
     "evaluate_model",
     "evaluate_program",
     "extract_program",
     "holds_program",
+    "imitate",
     "load_last_good",
     "load_pretrained",
     "make_fast_vec_env",

@@ -61,3 +61,16 @@ def test_demo_prints_a_table_and_writes_program_picture_and_film(tmp_path):
     small = load_program(folder / "simplified.json")
     assert json.loads((folder / "certificate.json").read_text())["program"] == program_digest(small)
     assert "<!DOCTYPE html>" in (folder / "hanoi.html").read_text()
+
+
+def test_distilled_network_is_printed_and_exported(tmp_path):
+    output = run("distill_sb3_model.py", tmp_path, "--states", "1000")
+    assert "Program for CartPole-v1" in output
+    assert "of the actions are the same" in output
+    assert (tmp_path / "policy.py").exists()
+
+
+def test_distilled_planner_is_compared_with_it(tmp_path):
+    output = run("distill_planner.py", tmp_path, "--env", "Stacking-v0", "--max-conditions", "0")
+    assert "round 11 of 11" in output
+    assert "success: planner 1.00" in output

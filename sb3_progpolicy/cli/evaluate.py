@@ -46,7 +46,7 @@ def evaluate(
     if as_json:
         typer.echo(json.dumps([row.to_json() for row in rows], indent=2))
     else:
-        _print_table(rows)
+        _print_table(rows, None if source.program is None else f"learned by {source.program.learned_by}")
 
 
 def _evaluate(
@@ -69,11 +69,11 @@ def _evaluate(
     return evaluate_source(source, chosen, episodes, kinds, env_id, seed=seed, max_steps=max_steps)
 
 
-def _print_table(rows: list[Evaluation]) -> None:
+def _print_table(rows: list[Evaluation], caption: str | None) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=f"{rows[0].env}, {rows[0].episodes} episode(s) each")
+    table = Table(title=f"{rows[0].env}, {rows[0].episodes} episode(s) each", caption=caption)
     names = list(dict.fromkeys(name for row in rows for name in row.variation))
     for name in [*names, "semantics"]:
         table.add_column(name)

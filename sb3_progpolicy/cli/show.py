@@ -68,6 +68,8 @@ def show(
         output = Path(_file_stem(source.program.metadata.get("env")) + f".{format_}")
     if output is None:
         typer.echo(content, nl=False)
+        if format_ == "text":
+            typer.echo(f"Learned by {source.program.learned_by}.", err=True)
     else:
         write_atomically(output, content)
         typer.echo(f"Wrote {output}", err=True)

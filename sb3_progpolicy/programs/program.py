@@ -9,6 +9,9 @@ from sb3_progpolicy.programs.export.text import export_text
 from sb3_progpolicy.programs.io import read_program, save_program
 from sb3_progpolicy.programs.syntax import ProgramData
 
+#: The ways in which a program is learned.
+LEARNED_BY = ("reinforcement", "imitation", "imitation+reinforcement")
+
 
 @dataclass(frozen=True)
 class Program(ProgramData):
@@ -26,6 +29,15 @@ class Program(ProgramData):
     :param temperature: temperature of the sigmoid in the soft semantics, above 0
     :param metadata: where the program comes from (environment id, seed, steps ...); JSON values only
     """
+
+    @property
+    def learned_by(self) -> str:
+        """How it was learned: one of :data:`LEARNED_BY`, or ``"unknown"`` if its metadata name something else.
+
+        Programs that say nothing are of releases in which there was reinforcement learning only.
+        """
+        named = self.metadata.get("learned_by", LEARNED_BY[0])
+        return named if named in LEARNED_BY else "unknown"
 
     def __str__(self) -> str:
         """The program as :func:`~sb3_progpolicy.programs.export_text` prints it."""

@@ -1,0 +1,70 @@
+"""Actions as labels, and outputs as actions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_progpolicy.imitation.decision_list import Floats
+from sb3_progpolicy.imitation.losses import BoxLoss, DiscreteLoss, Loss
+from sb3_progpolicy.spaces import ActionSpec
+
+
+class ActionCodec:
+    """Scales Box actions to [-1, 1] and writes Discrete ones as one 1 among zeros.
+
+    :param spec: the action space
+    :param names: one for each output
+    :raises ValueError: if the space is neither a Box nor Discrete
+    """
+
+    def __init__(self, spec: ActionSpec, names: tuple[str, ...]) -> None:
+        if spec.kind not in ("box", "discrete"):
+            raise ValueError(
+                f"{spec.kind} actions are not accepted here; Box and Discrete ones are. A MultiDiscrete space can be "
+                "written as one Discrete space of all combinations"
+            )
+        self.spec, self.names = spec, names
+        low, high = np.array(spec.low), np.array(spec.high)
+        self.bounded = np.isfinite(low) & np.isfinite(high)
+        self.middle = np.where(self.bounded, (low + high) / 2, 0.0)
+        self.half = np.where(self.bounded, (high - low) / 2, 1.0)
+        #: Size of a large output, ``(n_outputs,)``.
+        self.unit = self.half if spec.kind == "box" else np.ones(spec.n_outputs)
+
+    def loss(self) -> Loss:
+        """Return the loss of this action space; outputs named ``move_x``, ``move_y`` ... are one vector."""
+        if self.spec.kind == "discrete":
+            return DiscreteLoss()
+        moves = tuple(index for index, name in enumerate(self.names) if name.startswith("move_"))
+        return BoxLoss(self.bounded, moves if len(moves) > 1 else ())
+
+    def encode(self, actions: NDArray[Any]) -> Floats:
+        """Return labels ``(n, n_outputs)``."""
+        if self.spec.kind == "discrete":
+            return np.eye(self.spec.sizes[0])[np.asarray(actions, dtype=np.int64).ravel() - self.spec.start]
+        scaled = (np.asarray(actions, dtype=np.float64).reshape(len(actions), -1) - self.middle) / self.half
+        return np.where(self.bounded, np.clip(scaled, -1, 1), scaled)
+
+    def decode(self, outputs: Floats) -> NDArray[Any]:
+        """Return actions for the outputs of controllers that were fitted to labels, ``(n, n_outputs)``."""
+        if self.spec.kind == "discrete":
+            return outputs.argmax(axis=1) + self.spec.start
+        clipped = np.where(self.bounded, np.clip(outputs, -1, 1), outputs)
+        return (clipped * self.half + self.middle).astype(np.float32)
+
+    def to_action_units(self, controllers: Floats) -> Floats:
+        """Return controllers whose outputs are actions, ``(n_branches, n_outputs, n_inputs + 1)``."""
+        if self.spec.kind == "discrete":
+            return controllers
+        scaled = controllers * self.half[:, None]
+        scaled[..., -1] += self.middle
+        return scaled
+
+    def distance(self, actions: NDArray[Any], labels: NDArray[Any]) -> Floats:
+        """Return how far actions are from labels: 0 or 1 if Discrete, else the mean over numbers, in half ranges."""
+        if self.spec.kind == "discrete":
+            return (np.asarray(actions).ravel() != np.asarray(labels).ravel()).astype(np.float64)
+        return np.asarray(np.abs(self.encode(actions) - self.encode(labels)).mean(axis=1))

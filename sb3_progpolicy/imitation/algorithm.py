@@ -1,0 +1,369 @@
+"""DAgger with decision lists: the student acts more and more, the teacher labels what it meets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from progpolicy_envs import find_domain
+from sb3_progpolicy.imitation.actions import ActionCodec
+from sb3_progpolicy.imitation.augmentation import Augment, make_augmentation
+from sb3_progpolicy.imitation.conversion import rounded, to_program
+from sb3_progpolicy.imitation.decision_list import DecisionList
+from sb3_progpolicy.imitation.learner import Learner, Settings
+from sb3_progpolicy.imitation.rollouts import Collector, Episodes, Pool, Variations, play, program_act
+from sb3_progpolicy.imitation.saving import load_state, save_state
+from sb3_progpolicy.imitation.teachers import Teacher, TeacherLike, make_teacher
+from sb3_progpolicy.programs.program import Program
+from sb3_progpolicy.spaces import action_spec
+
+#: Share of the teacher in each round; 0 in all later ones.
+TEACHER_SHARES = (1.0, 0.6, 0.4, 0.3, 0.2, 0.1)
+N_ROUNDS, N_SPARSE_ROUNDS = 9, 2
+# Of the mean loss, and whether few inputs matter more; the sparsest program first.
+_TOLERANCES = ((0.012, True), (0.006, True), (0.003, True), (0.003, False), (0.001, False))
+_FINALISTS = 3
+_CHANGED = 0.02  # share of the actions, or mean distance, that rounding may change
+_HOPELESS = 6.0  # times the tolerance below what is needed
+_SHORT = (1, 2, 4, 7)  # numbers of branches that are tried at the end
+_DIGITS = (2, 3, 4, 6)
+#: Inputs that are not read by default: beyond the training sizes they take values that were never seen.
+IGNORED = ("left",)
+VALIDATION_SEED = 50_000_000  # no episode of the training has a seed near it
+
+
+@dataclass(frozen=True)
+class Imitation:
+    """How far an imitation has come.
+
+    :param round: rounds that are done
+    :param n_rounds: rounds in all
+    :param n_states: labelled states so far
+    :param result: of the best program in its validation: success, if there is a goal, steps and return
+    :param teacher: the teacher's
+    :param program: the best so far
+    """
+
+    round: int
+    n_rounds: int
+    n_states: int
+    result: Mapping[str, float]
+    teacher: Mapping[str, float]
+    program: Program
+
+
+def imitate(
+    teacher: TeacherLike,
+    env_id: str,
+    tasks: Variations | None = None,
+    n_timesteps: int = 24_000,
+    max_conditions: int = 11,
+    cell: str = "affine",
+    seed: int = 0,
+    *,
+    n_envs: int = 24,
+    interaction: bool = False,
+    ignore: Sequence[str] = IGNORED,
+    score_tolerance: float = 0.015,
+    n_episodes: int = 24,
+    env_kwargs: Mapping[str, Any] | None = None,
+    augment: str | Augment | None = None,
+    callback: Callable[[Imitation], None] | None = None,
+    checkpoint: Path | None = None,
+) -> Program:
+    """Return a program that does what a teacher does, learned from the teacher's actions, not from rewards.
+
+    .. code-block:: python
+
+        program = imitate("planner", "PandaPush-v0")
+        program = imitate(PPO("MlpPolicy", "CartPole-v1").learn(60_000), "CartPole-v1", n_timesteps=20_000)
+
+    States are visited by a mixture of teacher and student whose share of the teacher falls to 0, and labelled by the
+    teacher (DAgger, Ross et al. 2011). The program with the best episodes on training variations is made sparse and
+    round as far as its episodes stay as good. No other variation is looked at.
+
+    :param teacher: ``"planner"``, a model of Stable-Baselines3 or sb3-contrib, or a function from observations
+        ``(n_envs, n_observations)`` to actions
+    :param env_id: environment id
+    :param tasks: variations to learn on, the easiest first; by default those that the domain is trained on
+    :param n_timesteps: states to label
+    :param max_conditions: of the program at most
+    :param cell: of the conditions; ``"affine"``
+    :param seed: of all draws
+    :param n_envs: environments that are stepped together
+    :param interaction: whether the program reads its previous action, reward and done flag, too
+    :param ignore: names of inputs that the program must not read
+    :param score_tolerance: share of the score that fewer and rounder numbers may cost
+    :param n_episodes: of each validation, on training variations; the last ones have three times as many
+    :param env_kwargs: constructor arguments of the environment
+    :param augment: makes states that were not visited, which the teacher labels too: a function from observations and
+        a generator to observations, or ``"taller_towers"`` for PandaStack. What was learned so was shown more than the
+        training variations; the metadata say so
+    :param callback: is called after each round
+    :param checkpoint: file in which the state is kept after each round; one that exists is gone on from
+    :return: the program; its metadata say that it was learned by imitation, and of whom
+    :raises ValueError: if an argument is not accepted
+    """
+    if cell != "affine":
+        raise ValueError(f"cell={cell!r} is not accepted; conditions of imitated programs are 'affine'")
+    n_shares = N_ROUNDS + 1 + N_SPARSE_ROUNDS  # the first round has two
+    if n_timesteps < n_shares * n_envs or max_conditions < 0 or n_episodes < 1:
+        raise ValueError(
+            f"n_timesteps={n_timesteps}, max_conditions={max_conditions}, n_episodes={n_episodes} are not accepted; "
+            f"at least {n_shares * n_envs} (for n_envs={n_envs}), 0 and 1 are"
+        )
+    pool = Pool(env_id, n_envs, env_kwargs, interaction)
+    try:
+        run = _Run(pool, teacher, env_id, tasks, seed, max_conditions + 1, ignore, n_episodes, score_tolerance, augment)
+        return run.run(n_timesteps // (n_shares * n_envs), callback, checkpoint)
+    finally:
+        pool.close()
+
+
+Scored = tuple[float, DecisionList]
+
+
+class _Run:
+    """One imitation; see :func:`imitate`."""
+
+    def __init__(
+        self,
+        pool: Pool,
+        teacher: TeacherLike,
+        env_id: str,
+        tasks: Variations | None,
+        seed: int,
+        max_branches: int,
+        ignore: Sequence[str],
+        n_episodes: int,
+        score_tolerance: float,
+        augment: str | Augment | None,
+    ) -> None:
+        env: Any = pool.envs[0]
+        self.pool, self.seed, self.n_episodes = pool, seed, n_episodes
+        self.score_tolerance = score_tolerance
+        self.spec = action_spec(env.action_space)
+        self.inputs, self.outputs = names_of(env, self.spec.n_outputs, pool.interaction)
+        self.codec = ActionCodec(self.spec, self.outputs)
+        self.teacher: Teacher = make_teacher(teacher, env)
+        self.variations, ranks = training_variations(env_id, tasks)
+        largest = max(ranks)
+        # The smaller sizes are the ends of the larger ones, which therefore say more.
+        ranked = list(zip(self.variations, ranks, strict=True))
+        self.validation = [one for least in (largest - 1, largest) for one, rank in ranked if rank >= least]
+        augmentation = make_augmentation(augment, self.inputs)
+        self.collector = Collector(pool, self.teacher, self.variations, ranks, seed, augmentation)
+        self.origin: dict[str, Any] = {"env": env_id, "seed": seed, "teacher": self.teacher.name}
+        if augment is not None:
+            self.origin["augment"] = augment if isinstance(augment, str) else getattr(augment, "__name__", "function")
+        readable = np.array([name not in ignore for name in self.inputs])
+        self.learner = Learner(self.codec, readable, Settings(max_branches, seed))
+        self.best: Scored | None = None
+        self.runners_up: list[Scored] = []
+        self.final = False
+        self.result: dict[str, float] = {}
+        self.last_result: dict[str, float] = {}
+        self.teacher_episodes: Episodes | None = None
+
+    def run(self, n_steps: int, callback: Callable[[Imitation], None] | None, checkpoint: Path | None) -> Program:
+        """Run all rounds, or those that a checkpoint leaves."""
+        origin = {**self.origin, "n_steps": n_steps}
+        first = 0
+        if checkpoint is not None and checkpoint.exists():
+            first, self.best, self.collector.next_seed = load_state(checkpoint, origin, self.learner)
+            self.collector.rng = np.random.default_rng((self.seed, first))
+            self.runners_up = [self.best] if self.best is not None else []
+        self.final = first >= N_ROUNDS
+        self.teacher_episodes = play(self.pool, self.validation, self.n_episodes, VALIDATION_SEED, None, self.teacher)
+        self._limit_episodes()
+        self.collector.begin()
+        total = N_ROUNDS + N_SPARSE_ROUNDS
+        for number in range(first, total):
+            self._round(number, n_steps)
+            if checkpoint is not None:
+                save_state(checkpoint, origin, number + 1, self.learner, self.best, self.collector.next_seed)
+            if callback is not None:
+                callback(self._progress(number + 1, total))
+        return self._program(self._rounded())
+
+    def _round(self, number: int, n_steps: int) -> None:
+        learner = self.learner
+        share = TEACHER_SHARES[number] if number < len(TEACHER_SHARES) else 0.0
+        student = None if learner.raw is None else self._act(learner.raw)
+        visits = self.collector.collect(n_steps * (1 if number else 2), student, share)
+        targets = self.codec.encode(visits.actions) if visits.good is None else visits.good.astype(np.float64)
+        learner.add(visits.inputs, targets, visits.weights)
+        if number < N_ROUNDS - 1:
+            for candidate in learner.fit(number):
+                if number >= N_ROUNDS // 2 - 1:
+                    self._offer(candidate)
+            return
+        if number == N_ROUNDS - 1:
+            for candidate in learner.finish():
+                self._offer(candidate)
+            self._choose_finally()
+            self._make_short()
+            self._make_sparse()
+            return
+        self._offer(learner.refit_sparse(), sparse=True)
+
+    def _choose_finally(self) -> None:
+        """Let the best few play more episodes, which none of them was chosen by."""
+        self.final = True
+        self.best = None
+        for _, candidate in list(self.runners_up):
+            self._offer(candidate)
+
+    def _make_short(self) -> None:
+        """Go on with a list of fewer branches if its episodes are as good as the best ones."""
+        assert self.best is not None
+        score, best = self.best
+        for n_branches in (number for number in _SHORT if number < best.n_branches):
+            short = self.learner.short(n_branches)
+            if not self.learner.is_near(short, best):
+                continue
+            reached = self._score(short, score)
+            if self._as_good(reached, score):
+                self.best, self.result = (reached, short), self.last_result
+                return
+
+    def _make_sparse(self) -> None:
+        """Go on with the program of fewest inputs whose episodes are as good as the best ones."""
+        assert self.best is not None
+        score, dense = self.best
+        for tolerance, always_few in _TOLERANCES:
+            sparse = self.learner.sparse(dense, tolerance, always_few)
+            reached = self._score(sparse, score)
+            if self._as_good(reached, score):
+                self.best, self.learner.raw, self.result = (reached, sparse), sparse, self.last_result
+                return
+        self.learner.raw = dense
+
+    def _offer(self, candidate: DecisionList, sparse: bool = False) -> None:
+        """Keep a candidate if its episodes are better than the best so far."""
+        reached = self._score(candidate)
+        self.runners_up = sorted([*self.runners_up, (reached, candidate)], key=lambda scored: -scored[0])[:_FINALISTS]
+        if self.best is None or reached >= self.best[0] or (sparse and self._as_good(reached, self.best[0])):
+            self.best, self.result = (reached, candidate), self.last_result
+
+    def _rounded(self) -> DecisionList:
+        """Return the best list with as few digits as its episodes allow, its outputs in the unit of actions."""
+        assert self.best is not None
+        score, best = self.best
+        raw = DecisionList(best.conditions, self.codec.to_action_units(best.controllers))
+        states = self.learner.observations[:: max(1, self.learner.n_states // 2000)]
+        exact = self._act(best)(states)
+        for digits in _DIGITS:
+            candidate = rounded(raw, digits, self.codec.unit)
+            program = self._program(candidate)
+            changed = self.codec.distance(program_act(program, len(states))(states), exact).mean()
+            if changed <= _CHANGED and self._as_good(self._program_score(program, score), score, share=0.5):
+                return candidate
+        return raw
+
+    def _as_good(self, reached: float, score: float, share: float = 1.0) -> bool:
+        return reached >= score - share * self.score_tolerance * max(1.0, abs(score))
+
+    def _score(self, raw: DecisionList, needed: float | None = None) -> float:
+        return self._play(self._act(raw), needed)
+
+    def _program_score(self, program: Program, needed: float) -> float:
+        return self._play(program_act(program, len(self.pool)), needed)
+
+    @property
+    def _teacher_steps(self) -> float:
+        assert self.teacher_episodes is not None
+        return float(self.teacher_episodes.steps.mean())
+
+    def _play(self, act: Any, needed: float | None = None) -> float:
+        """Return the score in validation episodes; if the first third is far from what is needed, that of these."""
+        seed, n_episodes = VALIDATION_SEED, self.n_episodes
+        if self.final:
+            seed += n_episodes
+        episodes = play(self.pool, self.validation, n_episodes, seed, act)
+        score = episodes.score(self._teacher_steps)
+        if self.final and (needed is None or self._as_good(score, needed, share=_HOPELESS)):
+            episodes = play(self.pool, self.validation, 3 * n_episodes, seed, act)
+            score = episodes.score(self._teacher_steps)
+        self.collector.begin()
+        self.last_result = episodes.summary()
+        return score
+
+    def _act(self, raw: DecisionList) -> Any:
+        def act(inputs: np.ndarray) -> np.ndarray:
+            with_constant = np.column_stack([inputs.astype(np.float64), np.ones(len(inputs))])
+            return self.codec.decode(raw.outputs(with_constant))
+
+        return act
+
+    def _limit_episodes(self) -> None:
+        """End episodes of the mixture that take far longer than the teacher's."""
+        assert self.teacher_episodes is not None
+        if len(self.teacher_episodes.successes):
+            self.collector.limit = min(self.pool.cap, int(2 * self.teacher_episodes.steps.max() + 50))
+
+    def _progress(self, number: int, total: int) -> Imitation:
+        assert self.teacher_episodes is not None
+        assert self.learner.raw is not None
+        raw = self.learner.raw if self.best is None else self.best[1]
+        in_units = DecisionList(raw.conditions, self.codec.to_action_units(raw.controllers))
+        return Imitation(
+            number,
+            total,
+            self.learner.n_states,
+            self.result,
+            self.teacher_episodes.summary(),
+            self._program(in_units),
+        )
+
+    def _program(self, raw: DecisionList) -> Program:
+        return to_program(
+            raw,
+            self.spec,
+            self.inputs,
+            self.outputs,
+            self.pool.interaction,
+            **self.origin,
+            learned_by="imitation",
+            labelled_states=self.learner.n_states,
+        )
+
+
+def training_variations(env_id: str, tasks: Variations | None) -> tuple[Variations, list[int]]:
+    """Return the variations to learn on and the rank of each one's size.
+
+    :param env_id: environment id
+    :param tasks: variations, the easiest first; by default those that the domain is trained on
+    :raises ValueError: if there are none
+    """
+    domain = find_domain(env_id)
+    if tasks is not None and not len(tasks):
+        raise ValueError("tasks=[] is not accepted; at least one variation, such as {}, is needed")
+    variations: Variations = list(tasks) if tasks is not None else list(domain.train) if domain is not None else [{}]
+    if domain is None or not all(domain.size in variation for variation in variations):
+        return variations, [0] * len(variations)
+    sizes = sorted({variation[domain.size] for variation in variations})
+    return variations, [sizes.index(variation[domain.size]) for variation in variations]
+
+
+def names_of(env: Any, n_outputs: int, interaction: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return readable names of a program's inputs and outputs, the environment's own where it has them.
+
+    :param env: an environment
+    :param n_outputs: of a controller
+    :param interaction: whether the previous action, reward and done flag are inputs, too
+    """
+    n_observations = env.observation_space.shape[0]
+    inputs = tuple(map(str, getattr(env.unwrapped, "observation_names", ())))
+    outputs = tuple(map(str, getattr(env.unwrapped, "action_names", ())))
+    if len(inputs) != n_observations:
+        inputs = tuple(f"observation[{index}]" for index in range(n_observations))
+    if len(outputs) != n_outputs:
+        outputs = tuple(f"action[{index}]" for index in range(n_outputs))
+    if interaction:
+        inputs = (*inputs, *(f"previous {name}" for name in outputs), "previous reward", "previous done")
+    return inputs, outputs

@@ -1,0 +1,143 @@
+"""The program while it is fitted: conditions and controllers as arrays, on standardised inputs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+_CONSTANT = 1e-4  # an input that varies less than this is left out
+
+
+@dataclass(frozen=True)
+class Data:
+    """Labelled states.
+
+    :param inputs: standardised, ``(n, n_inputs + 1)``; the last column is 1
+    :param targets: labels, ``(n, n_outputs)``
+    :param weights: ``(n,)``
+    """
+
+    inputs: Floats
+    targets: Floats
+    weights: Floats
+
+    def __len__(self) -> int:
+        return len(self.inputs)
+
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Data:
+        """Return some of the states.
+
+        :param rows: a mask or indices
+        """
+        return Data(self.inputs[rows], self.targets[rows], self.weights[rows])
+
+    def weighted(self, factors: Floats) -> Data:
+        """Return the same states with their weights multiplied.
+
+        :param factors: ``(n,)``
+        """
+        return replace(self, weights=self.weights * factors)
+
+
+@dataclass(frozen=True)
+class Scaler:
+    """Shifts and scales inputs to mean 0 and variance 1, and leaves out those that do not vary or may not be read.
+
+    :param mean: ``(n_inputs,)``
+    :param scale: standard deviations, ``(n_inputs,)``
+    :param kept: which inputs are read, ``(n_inputs,)``
+    """
+
+    mean: Floats
+    scale: Floats
+    kept: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, observations: NDArray[np.floating], allowed: NDArray[np.bool_]) -> Scaler:
+        """Return the scaler of some observations.
+
+        :param observations: ``(n, n_inputs)``
+        :param allowed: which inputs may be read, ``(n_inputs,)``
+        """
+        deviation = observations.std(axis=0, dtype=np.float64)
+        varies = deviation >= _CONSTANT
+        return cls(observations.mean(axis=0, dtype=np.float64), np.where(varies, deviation, 1.0), allowed & varies)
+
+    def __call__(self, observations: NDArray[np.floating]) -> Floats:
+        """Return standardised inputs ``(n, n_kept + 1)``, the last column 1."""
+        scaled = ((observations - self.mean) / self.scale)[:, self.kept]
+        return np.column_stack([scaled, np.ones(len(observations))])
+
+    def to_raw(self, weights: Floats) -> Floats:
+        """Return weights ``(..., n_inputs + 1)`` on raw inputs for ``(..., n_kept + 1)`` on standardised ones."""
+        raw = np.zeros((*weights.shape[:-1], len(self.mean)))
+        raw[..., self.kept] = weights[..., :-1] / self.scale[self.kept]
+        return np.concatenate([raw, weights[..., -1:] - (raw * self.mean).sum(axis=-1, keepdims=True)], axis=-1)
+
+    def from_raw(self, raw: Floats) -> Floats:
+        """Return weights on standardised inputs for weights on raw ones; those of inputs left out are lost."""
+        constant = raw[..., -1:] + (raw[..., :-1] * self.mean).sum(axis=-1, keepdims=True)
+        return np.concatenate([raw[..., :-1][..., self.kept] * self.scale[self.kept], constant], axis=-1)
+
+
+@dataclass(frozen=True)
+class DecisionList:
+    """The first condition that holds decides which controller acts; the last controller acts where none holds.
+
+    :param conditions: ``(n_branches - 1, n_inputs + 1)``; one holds where its product with the inputs is not below 0
+    :param controllers: ``(n_branches, n_outputs, n_inputs + 1)``
+    """
+
+    conditions: Floats
+    controllers: Floats
+
+    @property
+    def n_branches(self) -> int:
+        """Number of controllers."""
+        return len(self.controllers)
+
+    def branches(self, inputs: Floats) -> NDArray[np.intp]:
+        """Return which controller acts, ``(n,)``.
+
+        :param inputs: ``(n, n_inputs + 1)``
+        """
+        holds = np.column_stack([inputs @ self.conditions.T >= 0, np.ones(len(inputs), dtype=bool)])
+        return holds.argmax(axis=1)
+
+    def outputs(self, inputs: Floats) -> Floats:
+        """Return what the acting controllers give, ``(n, n_outputs)``.
+
+        :param inputs: ``(n, n_inputs + 1)``
+        """
+        return np.asarray(np.einsum("nd,nod->no", inputs, self.controllers[self.branches(inputs)]))
+
+    def insert(self, position: int, condition: Floats, controller: Floats) -> DecisionList:
+        """Return the list with one more branch.
+
+        :param position: of the new branch; at most that of the last controller, which stays the last
+        :param condition: ``(n_inputs + 1,)``
+        :param controller: ``(n_outputs, n_inputs + 1)``
+        """
+        return DecisionList(
+            np.insert(self.conditions, position, condition, axis=0),
+            np.insert(self.controllers, position, controller, axis=0),
+        )
+
+    def without(self, index: int) -> DecisionList:
+        """Return the list without a branch; without the last one, the last condition's controller is the else.
+
+        :param index: of the controller
+        """
+        condition = min(index, len(self.conditions) - 1)
+        return DecisionList(np.delete(self.conditions, condition, axis=0), np.delete(self.controllers, index, axis=0))
+
+    def moved(self, old: Scaler, new: Scaler) -> DecisionList:
+        """Return the same list on inputs that are standardised otherwise.
+
+        :param old: of this list
+        :param new: of the list returned
+        """
+        return DecisionList(new.from_raw(old.to_raw(self.conditions)), new.from_raw(old.to_raw(self.controllers)))

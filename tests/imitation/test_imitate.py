@@ -1,0 +1,274 @@
+"""Whole imitations in small: teachers, visited states, checkpoints and the command line."""
+
+import dataclasses
+import json
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from sb3_contrib import RecurrentPPO
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from progpolicy_envs.panda import PandaStackEnv
+from sb3_progpolicy import compare_with_teacher, evaluate_program, imitate, load_pretrained
+from sb3_progpolicy.cli import run
+from sb3_progpolicy.imitation import algorithm, make_teacher
+from sb3_progpolicy.imitation.algorithm import training_variations
+from sb3_progpolicy.imitation.augmentation import taller_towers
+from sb3_progpolicy.imitation.learner import Settings
+from sb3_progpolicy.imitation.rollouts import STALL_WEIGHT, Collector, Pool, play
+from sb3_progpolicy.interaction import VecInteractionHistory
+from sb3_progpolicy.programs import Program, ProgramRunner
+
+SMALL = {"n_timesteps": 2000, "n_envs": 8, "n_episodes": 8, "max_conditions": 1}
+
+
+def balance(observations):
+    """A controller of CartPole that is one affine rule."""
+    return (observations @ [0.1, 0.5, 1.0, 1.0] > 0).astype(np.int64)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_gradient_steps():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(algorithm, "Settings", partial(Settings, round_steps=20, final_steps=100))
+        yield
+
+
+@pytest.fixture(scope="module")
+def balanced(few_gradient_steps):
+    return imitate(balance, "CartPole-v1", seed=1, **SMALL)
+
+
+def test_program_balances_as_its_teacher_does(balanced):
+    compared = compare_with_teacher(balance, balanced, "CartPole-v1", n_episodes=8)
+    assert compared.teacher["return"] == 500
+    assert compared.program["return"] >= 490
+    assert compared.distance < 0.3
+
+
+def test_program_says_how_it_was_learned(balanced, tmp_path):
+    assert balanced.metadata["learned_by"] == "imitation"
+    assert balanced.metadata["teacher"] == "balance"
+    assert balanced.metadata["env"] == "CartPole-v1"
+    balanced.save(tmp_path / "program.json")
+    assert Program.load(tmp_path / "program.json") == balanced
+
+
+def test_show_says_how_a_program_was_learned(balanced, tmp_path, capsys):
+    balanced.save(tmp_path / "program.json")
+    for name, learned in ((str(tmp_path / "program.json"), "imitation"), ("Hanoi-v0", "reinforcement")):
+        assert run(["show", name]) == 0
+        assert f"Learned by {learned}." in capsys.readouterr().err
+    forged = dataclasses.replace(balanced, metadata={"learned_by": "a genius"})
+    assert forged.learned_by == "unknown"
+
+
+def test_taller_towers_are_labelled_by_the_scripted_controller():
+    names = PandaStackEnv.observation_names
+    place = {name: index for index, name in enumerate(names)}
+    low = np.zeros((400, len(names)), np.float32)
+    raised = taller_towers(names)(low, np.random.default_rng(0))
+    assert (raised[:, place["target_z"]] > 0.03).all()
+    moved = {names[column] for column in np.flatnonzero((raised != low).any(axis=0))}
+    assert moved == {"gripper_z", "target_z", "target_dz", "object_dz"}
+    for way, thing in (("target_dz", "target_z"), ("object_dz", "object_z")):
+        difference = raised[:, place[thing]] - raised[:, place["gripper_z"]]
+        np.testing.assert_allclose(raised[:, place[way]], difference, atol=1e-6)
+    with pytest.raises(ValueError, match="has no gripper_z"):
+        imitate("planner", "Stacking-v0", augment="taller_towers")
+    with pytest.raises(ValueError, match="needs more than an observation"):
+        imitate("planner", "Stacking-v0", augment=lambda observations, rng: observations, **SMALL)
+
+
+def test_same_seed_gives_the_same_program(balanced):
+    assert imitate(balance, "CartPole-v1", seed=1, **SMALL) == balanced
+
+
+def test_box_actions_are_in_the_unit_of_the_environment():
+    def swing(observations):
+        return np.clip(-3.0 * observations[:, 1:2] - 0.5 * observations[:, 2:], -2, 2)
+
+    program = imitate(swing, "Pendulum-v1", **{**SMALL, "max_conditions": 0})
+    observations = np.random.default_rng(0).uniform(-1, 1, size=(50, 3))
+    acted = ProgramRunner(program, 50).act(observations)
+    np.testing.assert_allclose(acted, swing(observations), atol=0.15)
+
+
+def test_interrupted_imitation_goes_on(tmp_path, monkeypatch):
+    state, seen = tmp_path / "state.npz", []
+
+    def interrupt(so_far):
+        seen.append(so_far.round)
+        if so_far.round == 6:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        imitate(balance, "CartPole-v1", callback=interrupt, checkpoint=state, **SMALL)
+    program = imitate(balance, "CartPole-v1", callback=interrupt, checkpoint=state, **SMALL)
+    assert seen == [*range(1, 7), *range(7, 12)]
+    assert program.metadata["labelled_states"] == 12 * 8 * (2000 // (12 * 8))
+    with pytest.raises(ValueError, match="remove it to begin anew"):
+        imitate(balance, "CartPole-v1", seed=9, checkpoint=state, **SMALL)
+
+
+def test_planner_is_imitated_on_training_variations_only(monkeypatch):
+    seen = set()
+    reset = Pool.reset
+
+    def spy(self, row, seed, variation):
+        seen.add(tuple(variation.items()))
+        reset(self, row, seed, variation)
+
+    monkeypatch.setattr(Pool, "reset", spy)
+    program = imitate("planner", "Stacking-v0", **{**SMALL, "max_conditions": 2})
+    assert seen == {(("n_plates", n),) for n in (1, 2, 3, 4)}
+    assert program.metadata["teacher"] == "planner"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"teacher": "expert"}, "'expert' is not accepted; it is 'planner'"),
+        ({"teacher": 3}, "teacher=3 is not accepted"),
+        ({"teacher": "planner"}, "CartPole-v1 has no planner"),
+        ({"cell": "gru"}, "cell='gru' is not accepted"),
+        ({"n_timesteps": 5}, "n_timesteps=5"),
+        ({"tasks": []}, "at least one variation"),
+        ({"env_id": "CartPol-v1"}, "unknown environment"),
+        ({"teacher": lambda observations: np.zeros(1)}, "one action for each"),
+    ],
+)
+def test_what_is_not_accepted_is_said(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        imitate(**{"teacher": balance, "env_id": "CartPole-v1", **arguments})
+
+
+class Buttons(gym.Env):
+    observation_space = spaces.Box(-1, 1, (2,), np.float32)
+    action_space = spaces.MultiDiscrete([2, 2])
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(2, np.float32), 0.0, False, False, {}
+
+
+def test_several_discrete_actions_at_once_are_refused():
+    gym.register("Buttons-v0", entry_point=Buttons, max_episode_steps=5)
+    try:
+        with pytest.raises(ValueError, match="multi_discrete actions are not accepted"):
+            imitate(lambda observations: np.zeros((len(observations), 2)), "Buttons-v0")
+    finally:
+        gym.registry.pop("Buttons-v0")
+
+
+def steps_of(model, env_id, n_envs=3, n_steps=4):
+    """The actions of a model in an environment of its own, as SB3 runs it."""
+    venv = model.get_env()
+    venv.seed(7)
+    observations, state, dones, actions = venv.reset(), None, np.zeros(n_envs, bool), []
+    for _ in range(n_steps):
+        action, state = model.predict(observations, state, dones, deterministic=True)
+        observations, _, dones, _ = venv.step(action)
+        actions.append(action)
+    return np.array(actions)
+
+
+@pytest.mark.parametrize("kind", ["normalised", "recurrent", "history"])
+def test_model_sees_what_it_saw_in_training(kind):
+    venv = DummyVecEnv([lambda: gym.make("Pendulum-v1")] * 3)
+    if kind != "recurrent":
+        venv = VecNormalize(venv, norm_reward=False)
+    if kind == "history":
+        venv = VecInteractionHistory(venv)
+    model_class, policy = (RecurrentPPO, "MlpLstmPolicy") if kind == "recurrent" else (PPO, "MlpPolicy")
+    model = model_class(policy, venv, seed=0, n_steps=32, batch_size=32).learn(96)
+    if kind != "recurrent":
+        model.get_vec_normalize_env().training = False
+    expected = steps_of(model, "Pendulum-v1")
+    pool = Pool("Pendulum-v1", 3)
+    teacher = make_teacher(model, pool.envs[0])
+    for row in range(3):
+        pool.reset(row, 7 + row, {})
+    for wanted in expected:
+        actions = teacher.label(pool.situation())
+        np.testing.assert_allclose(actions, wanted, atol=1e-5)
+        pool.actions = actions
+        for row in range(3):
+            pool.step(row, actions[row])
+
+
+def test_program_is_a_teacher_too():
+    pool = Pool("Hanoi-v0", 2)
+    episodes = play(pool, [{"n_discs": 2}], 2, 0, None, make_teacher(load_pretrained("Hanoi-v0"), pool.envs[0]))
+    assert episodes.successes.all()
+    assert episodes.steps.tolist() == [3, 3]
+
+
+def test_state_in_which_the_student_stands_still_weighs_more_and_the_teacher_takes_over():
+    pool = Pool("Stacking-v0", 4)
+    variations, ranks = training_variations("Stacking-v0", None)
+    collector = Collector(pool, make_teacher("planner", pool.envs[0]), variations, ranks, seed=0)
+    collector.begin()
+
+    def stubborn(observations):
+        return np.zeros(len(observations), dtype=np.int64)
+
+    visits = collector.collect(150, stubborn, share=0.0)
+    assert visits.n_stalls > 0
+    assert set(visits.weights.tolist()) == {1.0, STALL_WEIGHT}
+    assert any(success for success, _ in visits.ended)
+
+
+def test_all_first_actions_of_shortest_solutions_are_labels():
+    pool = Pool("Stacking-v0", 4)
+    collector = Collector(
+        pool, make_teacher("planner", pool.envs[0]), *training_variations("Stacking-v0", None), seed=0
+    )
+    collector.begin()
+    visits = collector.collect(20, None, share=1.0)
+    assert visits.good.shape == (80, 5)
+    assert visits.good[np.arange(80), visits.actions].all()
+    assert (visits.good.sum(axis=1) == 2).any()
+
+
+def test_program_may_read_its_previous_action():
+    program = imitate("planner", "Hanoi-v0", tasks=[{"n_discs": 1}], interaction=True, **SMALL)
+    assert program.interaction
+    assert program.input_names[-2:] == ("previous reward", "previous done")
+    (row,) = evaluate_program(program, "Hanoi-v0", [{"n_discs": 1}], n_episodes=5)
+    assert row.success_rate == 1
+    compared = compare_with_teacher("planner", program, "Hanoi-v0", [{"n_discs": 1}], n_episodes=4)
+    assert compared.program["success"] == 1
+
+
+def test_each_size_is_drawn_twice_as_often_as_the_one_before():
+    variations, ranks = training_variations("HikingEgo-v0", None)
+    collector = Collector(Pool("HikingEgo-v0", 1), None, variations, ranks, seed=0)
+    shares = [sum(collector.chances[np.array(ranks) == rank]) for rank in range(4)]
+    np.testing.assert_allclose(shares, np.array([1, 2, 4, 8]) / 15)
+
+
+def test_command_line_distills_a_planner(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(algorithm, "N_ROUNDS", 3)
+    output = tmp_path / "program.json"
+    arguments = ["distill", "--from", "planner", "--env", "Stacking-v0", "--set", "n_plates=1", "-n", "1000"]
+    assert run([*arguments, "--max-conditions", "2", "--episodes", "4", "-o", str(output)]) == 0
+    printed = capsys.readouterr().out
+    assert "Program for Stacking-v0" in printed
+    assert "of its actions are the teacher's" in printed
+    assert [path.name for path in tmp_path.iterdir()] == ["program.json"]
+    assert (
+        run(["distill", "--from", str(output), "--set", "n_plates=1", "-n", "1000", "--episodes", "4", "--json"]) == 0
+    )
+    assert set(json.loads(capsys.readouterr().out)) == {"env", "n_conditions", "teacher", "program", "distance"}
+
+
+def test_command_line_says_what_is_missing(capsys):
+    assert run(["distill", "--from", "planner"]) == 2
+    assert "needs --env" in capsys.readouterr().err
