@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import logging
 import multiprocessing
 import os
 import signal
@@ -20,6 +19,7 @@ from typing import Any
 
 from sb3_progpolicy.benchmark.cell import NOTES, CellResult, run_cell
 from sb3_progpolicy.benchmark.suite import Cell
+from sb3_progpolicy.cluster import join_cluster
 from sb3_progpolicy.experiment.run import Interrupted, terminable
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.programs.files import write_atomically
@@ -150,19 +150,8 @@ class RayEngine(Engine):
 
     def __init__(self, jobs: int, folder: Path, address: str | None = None) -> None:
         super().__init__(jobs, folder)
-        try:
-            import ray
-        except ModuleNotFoundError:
-            raise ValueError('Ray is missing: pip install "sb3-progpolicy[ray]"') from None
-        self._ray: Any = ray
-        self._started = not ray.is_initialized()
-        if self._started:
-            own: dict[str, Any] = {} if address else {"num_cpus": jobs, "include_dashboard": False}
-            try:
-                ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)
-            except (ConnectionError, RuntimeError, ValueError) as error:
-                raise ValueError(f"the Ray cluster {address or 'here'} cannot be used: {error}") from None
-        self._remote = ray.remote(num_cpus=1, max_retries=0)(outcome_of)
+        self._ray, self._started = join_cluster(address, jobs)
+        self._remote = self._ray.remote(num_cpus=1, max_retries=0)(outcome_of)
         self._tasks: dict[Any, str] = {}
 
     @property

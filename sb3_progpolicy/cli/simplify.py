@@ -11,7 +11,7 @@ import typer
 
 from sb3_progpolicy.cli.parsing import ALLOW_PICKLE, check_folder, default_variations, parse_variations
 from sb3_progpolicy.cli.streams import quiet_stdout
-from sb3_progpolicy.experiment.sources import find_source
+from sb3_progpolicy.experiment.sources import find_program
 
 if TYPE_CHECKING:
     from sb3_progpolicy.analysis.simplify import Simplification
@@ -58,14 +58,9 @@ def simplify(
     from sb3_progpolicy.analysis.simplify import simplify as simplified
 
     with quiet_stdout():
-        source = find_source(run_or_name, allow_pickle)
-        if source.program is None:
-            raise ValueError(f"{run_or_name} is not a program; ProgPolicy and PRLPolicy learn programs")
-        env_id = env or source.env_id
-        if env_id is None:
-            raise ValueError(f"{run_or_name} does not say which environment it is for; give --env")
+        program, env_id = find_program(run_or_name, env, allow_pickle)
         found = simplified(
-            source.program,
+            program,
             env_id,
             parse_variations(variations) if variations else None,
             equally_good=equally_good,  # type: ignore[arg-type]
@@ -82,7 +77,7 @@ def simplify(
             _write_curve(found, curve)
         if output is not None:
             found.program.save(output)
-        rows = _compared(source.program, found.program, env_id, episodes, seed)
+        rows = _compared(program, found.program, env_id, episodes, seed)
     if as_json:
         typer.echo(json.dumps({**found.to_json(), "evaluation": rows}, indent=1))
         return

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +12,7 @@ import typer
 
 from sb3_progpolicy.cli.parsing import ALLOW_PICKLE, check_folder, parse_variations
 from sb3_progpolicy.cli.streams import quiet_stdout
-from sb3_progpolicy.experiment.sources import find_source
+from sb3_progpolicy.experiment.sources import Source, find_program
 
 if TYPE_CHECKING:
     from sb3_progpolicy.analysis.verify import Verification
@@ -56,13 +55,8 @@ def verify(
     if all_starts and starts is not None:
         raise ValueError("--all-starts and --starts are not accepted together")
     with quiet_stdout():
-        source = find_source(run_or_name, allow_pickle)
-        if source.program is None:
-            raise ValueError(f"{run_or_name} is not a program; ProgPolicy and PRLPolicy learn programs")
-        env_id = env or source.env_id
-        if env_id is None:
-            raise ValueError(f"{run_or_name} does not say which environment it is for; give --env")
-        rows = _verified(source.program, env_id, variations, all_starts, from_any_state, starts, seed)
+        program, env_id = find_program(run_or_name, env, allow_pickle)
+        rows = _verified(program, env_id, variations, all_starts, from_any_state, starts, seed)
     if as_json:
         typer.echo(json.dumps([row.to_json() for row in rows], indent=1))
     else:
@@ -70,12 +64,13 @@ def verify(
     failing = [row for row in rows if row.counterexample is not None]
     if output is not None and output.suffix.lower() == ".json":
         command = shlex.join(["progpolicy", *sys.argv[1:]])
-        write_atomically(output, json.dumps(certificate(source.program, env_id, rows, command), indent=1) + "\n")
+        write_atomically(output, json.dumps(certificate(program, env_id, rows, command), indent=1) + "\n")
     elif output is not None and failing:
         from sb3_progpolicy.experiment.film import record
 
         reset = failing[0].counterexample or {}
-        record(replace(source, env_id=env_id), output, reset["options"], seed=reset.get("seed", 0))
+        played = Source(run_or_name, env_id, program, None, {})
+        record(played, output, reset["options"], seed=reset.get("seed", 0))
         typer.echo(f"Wrote {output}", err=True)
     elif output is not None:
         typer.echo("No start fails, so there is no film.", err=True)

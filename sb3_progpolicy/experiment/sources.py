@@ -36,6 +36,23 @@ class Source:
     env_kwargs: dict[str, Any]
 
 
+def find_program(name: str, env: str | None = None, allow_pickle: bool = False) -> tuple[Program, str]:
+    """Load a program and say which environment it is for.
+
+    :param name: see :func:`find_source`
+    :param env: an environment in place of the one that it was trained in
+    :param allow_pickle: see :func:`find_source`
+    :raises ValueError: if it is not a program, or does not say which environment it is for
+    """
+    source = find_source(name, allow_pickle)
+    if source.program is None:
+        raise ValueError(f"{name} is not a program; ProgPolicy and PRLPolicy learn programs")
+    env_id = env or source.env_id
+    if env_id is None:
+        raise ValueError(f"{name} does not say which environment it is for; give --env")
+    return source.program, env_id
+
+
 def find_source(name: str, allow_pickle: bool = False) -> Source:
     """Load a run folder, a program's ``.json``, a model's ``.zip`` or a pretrained program, in this order.
 

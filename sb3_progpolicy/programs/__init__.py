@@ -24,7 +24,7 @@ from sb3_progpolicy.programs.syntax import (
 from sb3_progpolicy.programs.validation import check_program
 from sb3_progpolicy.spaces import ActionSpec
 
-# Where Program was in release 0.1; pickles name this place.
+# Where Program was in release 0.1; files of that release name this place.
 _syntax.Program = Program  # type: ignore[attr-defined]
 
 __all__ = [

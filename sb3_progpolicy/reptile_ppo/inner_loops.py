@@ -23,6 +23,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.logger import Logger
 
+from sb3_progpolicy.cluster import join_cluster
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.reptile.steps import Task
 from sb3_progpolicy.reptile_ppo.theta import Theta
@@ -226,15 +227,10 @@ class RayLoops(_RemoteLoops):
 
     def __init__(self, model: ReptilePPO, n_actors: int) -> None:
         super().__init__(model)
-        try:
-            import ray
-            from ray.util import ActorPool
-        except ModuleNotFoundError:
-            raise ValueError('Ray is missing: pip install "sb3-progpolicy[ray]"') from None
-        self._ray: Any = ray
-        self._started = not ray.is_initialized()
-        if self._started:
-            ray.init(log_to_driver=False, include_dashboard=False)
+        self._ray, self._started = join_cluster()
+        ray = self._ray
+        from ray.util import ActorPool
+
         n_actors = max(1, min(n_actors, int(ray.cluster_resources().get("CPU", 1))))
         saved = ray.put(_saved(model))
         actor = ray.remote(num_cpus=1, max_restarts=-1, max_task_retries=-1)(_Replica)
