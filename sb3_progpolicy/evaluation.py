@@ -94,7 +94,7 @@ def evaluate_program(
     if not env_id:
         raise ValueError("the program does not say which environment it is for, or names a module; give env_id")
 
-    _refuse_wrappers("the program", program.metadata.get("wrappers", ()))
+    refuse_wrappers("the program", program.metadata.get("wrappers", ()))
 
     def start(venv: VecEnv) -> Act:
         spec, n_observations = action_spec(venv.action_space), int(np.prod(venv.observation_space.shape or ()))
@@ -138,7 +138,7 @@ def evaluate_model(
     See :func:`evaluate_program` for the other arguments.
     """
     env = model.get_env()
-    _refuse_wrappers("the model", getattr(model, "wrappers", ()) if env is None else wrappers_of(env))
+    refuse_wrappers("the model", getattr(model, "wrappers", ()) if env is None else wrappers_of(env))
     normalizer = model.get_vec_normalize_env()
 
     def prepare(venv: VecEnv) -> VecEnv:
@@ -190,7 +190,12 @@ def evaluate_any(
     ]
 
 
-def _refuse_wrappers(what: str, wrappers: Sequence[str]) -> None:
+def refuse_wrappers(what: str, wrappers: Sequence[str]) -> None:
+    """Raise ``ValueError`` if something was trained in wrappers that an environment's id does not bring back.
+
+    :param what: was trained, for the message
+    :param wrappers: see :func:`~sb3_progpolicy.extraction.wrappers_of`
+    """
     if wrappers:
         raise ValueError(
             f"{what} was trained in an environment wrapped in {', '.join(wrappers)}, which an id alone does not bring "

@@ -171,7 +171,13 @@ class _Run:
 
     def run(self, n_steps: int, callback: Callable[[Imitation], None] | None, checkpoint: Path | None) -> Program:
         """Run all rounds, or those that a checkpoint leaves."""
-        origin = {**self.origin, "n_steps": n_steps}
+        origin = {
+            **self.origin,
+            "n_steps": n_steps,
+            "max_branches": self.learner.settings.max_branches,
+            "inputs": [name for name, read in zip(self.inputs, self.learner.readable, strict=True) if read],
+            "tasks": [dict(variation) for variation in self.variations],
+        }
         first = 0
         if checkpoint is not None and checkpoint.exists():
             first, self.best, self.collector.next_seed = load_state(checkpoint, origin, self.learner)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sb3_progpolicy.imitation.conditions import fit_condition, fit_sparse_condition
 from sb3_progpolicy.imitation.decision_list import Data, DecisionList, Floats
-from sb3_progpolicy.imitation.losses import Loss, list_losses, mean_loss
+from sb3_progpolicy.imitation.losses import Loss, mean_loss
 
 _NEIGHBOURS = 120
 _FAILURES = 2  # draws of controllers in a row of which none helps
@@ -270,6 +270,3 @@ def _rest_losses(losses: Floats, holds: NDArray[np.bool_]) -> list[Floats]:
     for index in reversed(range(holds.shape[1])):
         rest.insert(0, np.where(holds[:, index], losses[:, index], rest[0]))
     return rest
-
-
-__all__ = ["alternate", "drop_branches", "fit_planes", "grow", "list_losses", "local_controllers", "sparsify"]

@@ -39,7 +39,7 @@ def save_state(
         for part in ("conditions", "controllers")
     }
     score = None if best is None else best[0]
-    about = {"origin": dict(origin), "number": number, "score": score, "next_seed": next_seed}
+    about = {"origin": _as_json(origin), "number": number, "score": score, "next_seed": next_seed}
     content = io.BytesIO()
     np.savez_compressed(
         content,
@@ -68,14 +68,24 @@ def load_state(path: Path, origin: Mapping[str, Any], learner: Learner) -> tuple
         known = about["origin"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path} is not the state of an imitation: {error}; remove it to begin anew") from None
-    if known != dict(origin):
-        raise ValueError(f"{path} is of {known}, not of {dict(origin)}; remove it to begin anew")
+    given = _as_json(origin)
+    different = [name for name in {**known, **given} if known.get(name) != given.get(name)]
+    if different:
+        raise ValueError(
+            f"{path} is of an imitation with another {', '.join(different)}; give the same arguments, or remove it to "
+            "begin anew"
+        )
     learner.observations = parts["observations"]
     learner.targets, learner.weights = parts["targets"].astype(np.float64), parts["weights"].astype(np.float64)
     learner.rng = np.random.default_rng((learner.settings.seed, about["number"]))
     learner.raw = _list(parts, "present")
     best = _list(parts, "best")
     return about["number"], None if best is None else (about["score"], best), about["next_seed"]
+
+
+def _as_json(origin: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a file gives back when it has been written and read."""
+    return dict(json.loads(json.dumps(dict(origin), default=str)))
 
 
 def _list(parts: Mapping[str, Any], name: str) -> DecisionList | None:

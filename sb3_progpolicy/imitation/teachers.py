@@ -188,11 +188,11 @@ class ModelTeacher:
     """
 
     def __init__(self, model: BaseAlgorithm, observation_space: Any, spec: ActionSpec) -> None:
-        from sb3_progpolicy.evaluation import _refuse_wrappers
+        from sb3_progpolicy.evaluation import refuse_wrappers
         from sb3_progpolicy.extraction import wrappers_of
 
         env = model.get_env()
-        _refuse_wrappers("the teacher", getattr(model, "wrappers", ()) if env is None else wrappers_of(env))
+        refuse_wrappers("the teacher", getattr(model, "wrappers", ()) if env is None else wrappers_of(env))
         self.model, self.spec, self.name = model, spec, type(model).__name__
         self.normalizer = model.get_vec_normalize_env()
         assert model.observation_space is not None
