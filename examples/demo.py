@@ -108,7 +108,7 @@ def main() -> None:
     console.print(export_text(program), markup=False, highlight=False, soft_wrap=True)
     console.print(results_table(program))
 
-    found = simplify(program, time_limit=5)
+    found = simplify(program, time_limit=3)
     small = found.program
     console.print(f"{found.terms_before} numbers, of which {found.terms_after} terms make the same decisions:\n")
     console.print(export_text(small, max_terms=None), markup=False, highlight=False, soft_wrap=True)

@@ -232,6 +232,7 @@ def test_long_sums_become_loops_that_add_in_the_same_order(n_observations, tmp_p
     check_actions(replace(program, body=replace(controller, weights=weights)), tmp_path, 100)
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("shape", LARGEST)
 def test_header_of_a_largest_program_compiles(shape, tmp_path):

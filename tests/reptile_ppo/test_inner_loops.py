@@ -41,7 +41,7 @@ def assert_same(a, b):
 
 
 @pytest.mark.parametrize(("engine", "policy", "arguments"), [
-    ("ray", "ProgPolicy", {}),
+    pytest.param("ray", "ProgPolicy", {}, marks=pytest.mark.slow),
     ("local", "ProgPolicy", {"normalize_observations": True, "scale_rewards": True, "meta_optimizer": "adam"}),
     ("local", "MlpPolicy", {"search_fraction": 0.0}),
 ])  # fmt: skip
