@@ -11,7 +11,7 @@ FUZZERS = {
     "exports": Fuzzer(exports.case, cases=1_000, short=100),
     "configurations": Fuzzer(configurations.case, cases=1_000, short=100),
     "models": Fuzzer(models.case, cases=10_000, short=200),
-    "kills": Fuzzer(kills.case, cases=40, short=0),  # tests/test_resume.py has one
+    "kills": Fuzzer(kills.case, cases=40, short=1),
 }
 
 
