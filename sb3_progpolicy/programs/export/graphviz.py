@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
-from sb3_progpolicy.programs.export.grids import blocks_of, collapse, terms_to_show
+from sb3_progpolicy.programs.export.grids import MaxTerms, blocks_of, collapse, terms_to_show
 from sb3_progpolicy.programs.export.visitor import (
     CELL_NAMES,
     Decimals,
@@ -24,7 +24,7 @@ def export_graphviz(
     program: ProgramData,
     out_file: str | os.PathLike[str] | Any | None = None,
     decimals: int = 2,
-    max_terms: int | None = None,
+    max_terms: MaxTerms = "auto",
 ) -> str | None:
     """Draw a program in the DOT language.
 
@@ -34,7 +34,8 @@ def export_graphviz(
     :param program: what to draw
     :param out_file: a path or an open text file to write to
     :param decimals: digits after the point
-    :param max_terms: terms shown of each sum; by default all where no sum has more than six, else three
+    :param max_terms: terms shown of each sum, ``None`` for all; by default all where no sum has more than six, else
+        three
     :return: the DOT source if ``out_file`` is ``None``, else ``None``
     :raises ValueError: if the program is not well formed
     """
@@ -51,7 +52,7 @@ def export_graphviz(
 
 
 class _DotPrinter(ProgramVisitor[list[str]]):
-    def __init__(self, program: ProgramData, decimals: int, max_terms: int | None) -> None:
+    def __init__(self, program: ProgramData, decimals: int, max_terms: MaxTerms) -> None:
         super().__init__(program)
         self.number = Decimals(program, decimals)
         self.max_terms, self.blocks = terms_to_show(program, max_terms), blocks_of(program)

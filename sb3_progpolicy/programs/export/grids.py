@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from sb3_progpolicy.programs.syntax import ProgramData
 #: Said where a function of row and column is printed.
 #: A picture shows sums of up to so many terms in full, and of larger ones so many.
 FEW_TERMS, MOST_TERMS = 6, 3
+MaxTerms = int | None | Literal["auto"]
 LEGEND = "{name}*(...) is summed over all cells {name}[row,column]; rows and columns count from 0."
 
 
@@ -103,13 +104,13 @@ def collapse(blocks: Sequence[Block], weights: Sequence[float], names: Sequence[
     return left, named
 
 
-def terms_to_show(program: ProgramData, max_terms: int | None) -> int | None:
+def terms_to_show(program: ProgramData, max_terms: MaxTerms) -> int | None:
     """Return how many terms of each sum a small picture shows: all where there are few, else three.
 
     :param program: that is drawn
-    :param max_terms: as given; ``None`` to choose
+    :param max_terms: as given; ``"auto"`` to choose, ``None`` for all
     """
-    if max_terms is not None:
+    if max_terms != "auto":
         return max_terms
     blocks = blocks_of(program)
     rows = [row for controller in program.controllers for row in controller.weights]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sb3_progpolicy.programs.export.grids import blocks_of, collapse, terms_to_show
+from sb3_progpolicy.programs.export.grids import MaxTerms, blocks_of, collapse, terms_to_show
 from sb3_progpolicy.programs.export.visitor import (
     CELL_NAMES,
     Decimals,
@@ -44,7 +44,7 @@ class _Card:
 
 
 def plot_program(
-    program: ProgramData, ax: Any = None, decimals: int = 1, max_terms: int | None = None, max_outputs: int = MAX_ROWS
+    program: ProgramData, ax: Any = None, decimals: int = 1, max_terms: MaxTerms = "auto", max_outputs: int = MAX_ROWS
 ) -> Any:
     """Draw a program: conditions on the left from top to bottom, the controller that each leads to on the right.
 
@@ -55,8 +55,8 @@ def plot_program(
     :param program: what to draw
     :param ax: matplotlib axes to draw into; by default a new figure of the size that the program needs
     :param decimals: digits after the point
-    :param max_terms: terms shown of each sum, the constant not counted; by default all where no sum has more than six,
-        else three
+    :param max_terms: terms shown of each sum, the constant not counted, ``None`` for all; by default all where no sum
+        has more than six, else three
     :param max_outputs: outputs shown of each controller
     :return: the axes
     :raises ValueError: if the program is not well formed
@@ -119,7 +119,7 @@ def _how_to_read(program: ProgramData, whole: bool) -> tuple[str, ...]:
 class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
     """Turns every step of the program into a condition card (none for the last) and a controller card."""
 
-    def __init__(self, program: ProgramData, decimals: int, max_terms: int | None, max_outputs: int) -> None:
+    def __init__(self, program: ProgramData, decimals: int, max_terms: MaxTerms, max_outputs: int) -> None:
         super().__init__(program)
         self.number, self.max_outputs = Decimals(program, decimals), max_outputs
         self.max_terms, self.blocks = terms_to_show(program, max_terms), blocks_of(program)
