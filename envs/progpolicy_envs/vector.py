@@ -261,6 +261,7 @@ class PlanningVectorEnv(DomainVectorEnv):
         require_reset(self._started, "state_of()")
         return self._state_of(row)
 
+    @abstractmethod
     def _put_starts(
         self, variation: Variation, given: Mapping[str, Any], numbers: NDArray[np.int64], any_state: bool
     ) -> None:
@@ -268,8 +269,9 @@ class PlanningVectorEnv(DomainVectorEnv):
 
         :param variation: the whole variation
         :param given: those of its values that were given
+        :param numbers: ``(num_envs,)``, each below :meth:`count_starts`
+        :param any_state: whether they number all legal states
         """
-        raise NotImplementedError
 
     def optimal_steps(self) -> NDArray[np.int64]:
         """Return how many steps the planner needs from each environment's present state, ``(num_envs,)``."""

@@ -17,6 +17,7 @@ from sb3_progpolicy.analysis.box import Point, Pruned, prune
 from sb3_progpolicy.analysis.integer import MAX_WEIGHT, Solution, fewest_terms
 from sb3_progpolicy.analysis.situations import Situations, meet
 from sb3_progpolicy.analysis.terms import Floats, Term, terms_of
+from sb3_progpolicy.evaluation import refuse_wrappers
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.programs.interpreter import ProgramRunner
 from sb3_progpolicy.programs.io import program_digest
@@ -132,9 +133,12 @@ def simplify(
         raise unknown("equally_good", equally_good, ("program", "planner"))
     if program.action.kind not in ("discrete", "box"):
         raise ValueError(f"{program.action.kind} actions are not accepted here; Discrete and Box ones are")
+    refuse_wrappers("the program", program.metadata.get("wrappers", ()))
     domain = get_domain(env_id)
     variations = domain.trained if variations is None else variations
     if program.action.kind == "box":
+        if equally_good != "program":
+            raise ValueError(f"equally_good={equally_good!r} is not accepted for Box actions; it is for Discrete ones")
         symmetries = domain.symmetries if tie else ()
         pruned = prune(
             program,
@@ -159,8 +163,7 @@ def simplify(
         rules = _Rules(program, situations, domain, tie, time_limit, max_weight)
         small = rules.program()
         met = meet(small, env_id, variations, n_starts, planner, seed + number, situations)
-        if not planner:
-            met = _relabelled(met, len(situations.inputs), program)
+        met = _relabelled(met, len(situations.inputs), program, planner)
         wrong = _wrong(small, met)
         if not wrong.any():
             situations = met
@@ -227,17 +230,21 @@ def _is_whole(grid: Any) -> bool:
     return len(set(grid.rows)) * len(set(grid.columns)) == len(grid.rows)
 
 
-def _relabelled(met: Situations, n_known: int, program: ProgramData) -> Situations:
-    """Let the original say what is to be done in situations that only the simplified program has met."""
-    new = met.inputs[n_known:]
-    if not len(new) or any(condition.cell != "affine" for condition in program.conditions):
+def _relabelled(met: Situations, n_known: int, program: ProgramData, planner: bool) -> Situations:
+    """Let the original say which branch situations belong to, and what is to be done in those that it has not met.
+
+    :param met: situations, some of which only the simplified program has met, whose branches have other numbers
+    :param n_known: how many the original has met; these come first
+    :param program: the original
+    :param planner: whether the planner has said what may be done
+    """
+    if any(condition.cell != "affine" for condition in program.conditions):
         return met
-    runner = ProgramRunner(program, len(new))
-    allowed, branches = met.allowed.copy(), met.branches.copy()
-    allowed[n_known:] = False
-    allowed[np.arange(n_known, len(allowed)), runner.act(new) - program.action.start] = True
-    branches[n_known:] = runner.branch
-    return dataclasses.replace(met, allowed=allowed, branches=branches)
+    runner, allowed = ProgramRunner(program, len(met.inputs)), met.allowed.copy()
+    actions = runner.act(met.inputs) - program.action.start
+    if not planner:
+        allowed[n_known:] = np.eye(allowed.shape[1], dtype=bool)[actions[n_known:]]
+    return dataclasses.replace(met, allowed=allowed, branches=runner.branch)
 
 
 def _wrong(program: ProgramData, situations: Situations) -> NDArray[np.bool_]:

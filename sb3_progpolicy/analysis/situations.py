@@ -25,7 +25,6 @@ class Situations:
     :param branches: index of the controller that is reached, ``(n,)``; -1 where it depends on memory
     :param starts: from how many starts they come
     :param exhaustive: whether these were all starts
-    :param failures: starts from which the goal was not reached
     """
 
     inputs: NDArray[np.float64]
@@ -33,7 +32,6 @@ class Situations:
     branches: NDArray[np.int64]
     starts: int
     exhaustive: bool
-    failures: int
 
 
 class _Collector:
@@ -112,7 +110,7 @@ def meet(
             collector.found[row.tobytes()], collector.branches[row.tobytes()] = mask, branch
             collector.inputs.append(row)
     rng, cap = np.random.default_rng(seed), cap_of(env_id)
-    starts, failures, exhaustive = 0, 0, True
+    starts, exhaustive = 0, True
     for variation in variations:
         count = make_batch(program, env_id, 1).count_starts(variation)
         numbers = start_numbers(count, n_starts, rng)
@@ -120,11 +118,10 @@ def meet(
         for part in batches(numbers, BATCH):
             venv = make_batch(program, env_id, len(part))
             observations = venv.reset_to(variation, part)
-            steps = run_episodes(program, venv, observations, venv.optimal_steps(), cap, collector)
-            failures += int((steps < 0).sum())
+            run_episodes(program, venv, observations, venv.optimal_steps(), cap, collector)
         starts += len(numbers)
     inputs = np.array(collector.inputs).reshape(-1, program.n_inputs)
     keys = [row.tobytes() for row in inputs]
     allowed = np.array([collector.found[key] for key in keys]).reshape(-1, program.action.n_outputs)
     branches = np.array([collector.branches[key] for key in keys], dtype=np.int64)
-    return Situations(inputs, allowed, branches, starts, exhaustive, failures)
+    return Situations(inputs, allowed, branches, starts, exhaustive)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from progpolicy_envs import find_domain
 from sb3_progpolicy.analysis.rollout import batches, cap_of, make_batch, run_episodes, start_numbers
+from sb3_progpolicy.evaluation import refuse_wrappers
 from sb3_progpolicy.programs.interpreter import ProgramRunner, join_inputs
 from sb3_progpolicy.programs.io import program_digest
 from sb3_progpolicy.programs.syntax import ProgramData
@@ -93,6 +94,7 @@ def verify(
         raise ValueError(f"all_starts and n_starts={n_starts} are not accepted together")
     if n_starts is not None and n_starts < 1:
         raise ValueError(f"n_starts={n_starts} is not accepted; it is at least 1")
+    refuse_wrappers("the program", program.metadata.get("wrappers", ()))
     domain = find_domain(env_id)
     if variations is None:
         variations = [{}] if domain is None else domain.trained
@@ -113,9 +115,8 @@ def verify(
 
 
 def _count(program: ProgramData, env_id: str, variation: Mapping[str, Any], any_state: bool) -> int | None:
-    spec = gym.spec(env_id.rpartition(":")[2])
     domain = find_domain(env_id)
-    if domain is None or domain.simulation or spec.vector_entry_point is None:
+    if domain is None or domain.simulation or not domain.vector_entry_point:
         if any_state:
             raise ValueError(f"{env_id}: its legal states cannot be counted; leave out from_any_state")
         return None

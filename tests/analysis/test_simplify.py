@@ -14,6 +14,7 @@ from sb3_progpolicy.analysis.integer import fewest_terms
 from sb3_progpolicy.analysis.simplify import count_numbers, simplify
 from sb3_progpolicy.analysis.situations import good_actions, meet
 from sb3_progpolicy.analysis.terms import terms_of
+from sb3_progpolicy.analysis.verify import verify
 from sb3_progpolicy.cli import run
 from sb3_progpolicy.evaluation import evaluate_program
 from sb3_progpolicy.programs import Condition, Controller, IfThenElse, ProgramRunner, load_program
@@ -131,6 +132,20 @@ def test_branches_that_never_act_are_dropped():
     assert found.terms_after == 4
 
 
+def test_branches_keep_their_numbers_where_an_earlier_one_is_dropped():
+    # The first of three branches never acts; what only the small program meets belongs to the others all the same.
+    program = load_pretrained("Hanoi-v0")
+    inner = with_a_condition(program, -1.3).body
+    never = dataclasses.replace(inner.condition, readout_bias=-100.0)
+    nested = dataclasses.replace(program, body=IfThenElse(never, program.controllers[0], inner))
+    for equally_good in ("program", "planner"):
+        found = simplify(nested, equally_good=equally_good, tie=False, time_limit=3)
+        assert len(found.program.conditions) == 1
+        assert found.notes == ()
+        for row in evaluate_program(found.program, variations=DOMAINS["Hanoi-v0"].trained):
+            assert row.ratio == 1
+
+
 def test_recurrent_conditions_stay_and_it_is_said(hanoi):
     program = hanoi.program
     cell = Condition("rnn", ((0.1,) * 17,), ((0.5,),), (0.0,), (0.0,), (1.0,), -9.0)
@@ -179,6 +194,19 @@ def test_fewest_terms_are_found_with_their_bound():
     assert (solution.n_terms, solution.lower_bound) == (1, 1)
     assert solution.weights[0] == 1
     assert fewest_terms(np.array([[1.0, 0.0], [-1.0, 0.0]]), 5) is None
+
+
+def test_continuous_actions_have_no_equally_good_ones():
+    with pytest.raises(ValueError, match="equally_good='planner' is not accepted for Box actions"):
+        simplify(load_pretrained("PandaReach-v0"), equally_good="planner")
+
+
+@pytest.mark.parametrize("analyse", [simplify, verify])
+def test_program_of_a_wrapped_environment_is_refused(analyse):
+    program = load_pretrained("Hanoi-v0")
+    wrapped = dataclasses.replace(program, metadata={**program.metadata, "wrappers": ["VecFrameStack"]})
+    with pytest.raises(ValueError, match="VecFrameStack"):
+        analyse(wrapped)
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
