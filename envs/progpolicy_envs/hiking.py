@@ -230,6 +230,16 @@ class HikingVectorEnv(_WholeMap, PathwayVectorEnv):
 class HikingEgoVectorEnv(_FramedMap, PathwayVectorEnv):
     """N :class:`HikingEgoEnv`; see :class:`PathwayVectorEnv`."""
 
+    #: Where the window of a cell begins in its map.
+    _corners: ClassVar[NDArray[np.int64]] = _FramedMap.places - REACH * _FRAME_WIDTH - REACH
+
     def _observe(self) -> NDArray[np.float32]:
-        centres = self._first_places + self.places[self._hikers]
-        return self._numbers.ravel().take(centres[:, None] + _WINDOW_OFFSETS)
+        numbers, side, step = self._numbers, 2 * REACH + 1, self._numbers.itemsize
+        # A view of every window by the place of its first cell: rows of it are copied at once.
+        n_windows = numbers.size - (side - 1) * (_FRAME_WIDTH + 1)
+        windows = np.ndarray((n_windows, side, side), np.float32, numbers, 0, (step, _FRAME_WIDTH * step, step))
+        seen = windows[self._first_places + self._corners[self._hikers]].reshape(self.num_envs, side**2)
+        observations = np.empty((self.num_envs, len(_WINDOW)), dtype=np.float32)
+        own = len(_WINDOW) // 2
+        observations[:, :own], observations[:, own:] = seen[:, :own], seen[:, own + 1 :]
+        return observations
