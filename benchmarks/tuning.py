@@ -1,8 +1,8 @@
 """The search behind the comparison: the same trials for every method on the planning domains.
 
 Eight trials are trained at a shortened budget and scored on validation variations (``progpolicy tune``); no unseen one
-is looked at. What is best then need not be best in the end, so the best and the values of the file are trained with the
-full budget, too (``--full``), and the better of the two goes into the file. It goes on where it was: what
+is looked at. What is best then need not be best in the end, so the best and the values of the file can be trained with
+the full budget, too (``--full``), and the better of the two goes into the file. It goes on where it was: what
 ``benchmarks/results/tuning.csv`` has of a study is not made again, and several processes may share a storage.
 
     python benchmarks/tuning.py --storage sqlite:///runs/tuning.db [--full] [--methods ppo sac] [--envs Hanoi-v0]
