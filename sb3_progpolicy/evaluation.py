@@ -23,6 +23,7 @@ from sb3_progpolicy.interaction import VecInteractionHistory
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.programs.interpreter import ProgramRunner, Semantics, join_inputs
 from sb3_progpolicy.programs.syntax import ProgramData
+from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, unread_names
 from sb3_progpolicy.spaces import action_spec, interaction_space
 from sb3_progpolicy.vec_env import BatchedVecEnv, make_fast_vec_env
 
@@ -242,11 +243,20 @@ def _evaluate(
     domain = find_domain(env_id)
     # In a batch those that have finished go on until the last has, which is expensive where a step is a simulation.
     batched = spec.vector_entry_point is not None and not (domain is not None and domain.simulation)
-    for group in _groups(variations, batched):
+    arguments = dict(env_kwargs or {})
+    # Parameters that a domain's environment reads as options are known; another's constructor may be where they go.
+    by_constructor = (
+        set().union(*(constructor_arguments(env_id, variation, arguments) for variation in variations))
+        if domain is None
+        else set[str]()
+    )
+    for group in _groups(variations, batched and not by_constructor):
         first = len(rows)
-        venv = prepare(make_fast_vec_env(env_id, len(group), max_episode_steps=cap, **(env_kwargs or {})))
+        fixed = {name: value for name, value in group[0].items() if name in by_constructor}
+        options = [{name: value for name, value in each.items() if name not in by_constructor} for each in group]
+        venv = prepare(make_fast_vec_env(env_id, len(group), max_episode_steps=cap, **{**arguments, **fixed}))
         try:
-            success, steps, optimal = _play(venv, group, n_episodes, seed + first, cap, start(venv))
+            success, steps, optimal = _play(venv, options, n_episodes, seed + first, cap, start(venv))
         finally:
             venv.close()
         rows += [
@@ -286,8 +296,13 @@ def _play(
     steps = np.full((n_envs, n_episodes), float(cap))
     optimal = np.full((n_envs, n_episodes), np.nan)
     venv.seed(seed)
-    venv.set_options([dict(variation) for variation in variations])
+    given = [ReadOptions(variation) for variation in variations]
+    venv.set_options(list(given))
     observations: Any = venv.reset()
+    if unread := unread_names(given):
+        raise ValueError(
+            f"the reset option {', '.join(sorted(unread))} has no effect; the environment does not read it"
+        )
     optimal[:, 0] = _optimal_steps(venv)
     rewards, dones = np.zeros(n_envs, dtype=np.float32), np.zeros(n_envs, dtype=bool)
     finished, elapsed = np.zeros(n_envs, dtype=np.int64), np.zeros(n_envs, dtype=np.int64)

@@ -36,10 +36,10 @@ def make(policy):
     )
 
 
-def train(model, path, checkpoint_class=ReptileCheckpoint):
+def train(model, path, checkpoint_class=ReptileCheckpoint, timesteps=TIMESTEPS):
     """Train to the end, with checkpoints, and return the final parameters by name."""
     checkpoint = checkpoint_class(path, save_freq=512)
-    model.learn(TIMESTEPS - model.num_timesteps, checkpoint, reset_num_timesteps=model.num_timesteps == 0)
+    model.learn(timesteps - model.num_timesteps, checkpoint, reset_num_timesteps=model.num_timesteps == 0)
     model.save(path.with_suffix(".final.zip"))
     return parameters(path)
 

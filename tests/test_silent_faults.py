@@ -25,6 +25,8 @@ from sb3_progpolicy import (
     evaluate_program,
     extract_program,
 )
+from sb3_progpolicy.experiment.config import make_config
+from sb3_progpolicy.experiment.run import build_model
 from sb3_progpolicy.programs import ProgramRunner
 
 SMALL = {"n_steps": 16, "batch_size": 32, "n_epochs": 2, "seed": 0, "device": "cpu"}
@@ -90,6 +92,52 @@ def test_reset_option_that_nothing_reads_is_an_error():
         PPO("MlpPolicy", make_vec_env("Pendulum-v1", 2), **SMALL).learn(64, callback=ReptileWrapper(tasks))
     # One that is read is accepted.
     ReptilePPO("ProgPolicy", make_vec_env("Pendulum-v1", 2), tasks={"x_init": [0.1]}, **SMALL).learn(64)
+
+
+class Gravity(gym.Env):
+    """One step; it succeeds where the constructor's gravity is 2, whatever the reset options say."""
+
+    observation_space, action_space = gym.spaces.Box(-9, 9, (1,)), gym.spaces.Discrete(2)
+
+    def __init__(self, gravity=1.0, render_mode=None):
+        self.gravity = gravity
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.array([self.gravity], np.float32), {}
+
+    def step(self, action):
+        done = self.gravity == 2.0
+        return np.array([self.gravity], np.float32), 0.0, True, False, {"is_success": done}
+
+
+@pytest.fixture
+def gravity_env():
+    gym.register("Gravity-v0", entry_point=Gravity, max_episode_steps=5)
+    yield "Gravity-v0"
+    del gym.registry["Gravity-v0"]
+
+
+def test_variation_that_only_the_constructor_takes_is_made_by_it(gravity_env, tmp_path):
+    said = r"Gravity-v0 does not read the reset option gravity, .* \(apply='constructor'\)"
+    tasks = {"gravity": [1.0, 2.0]}
+    with pytest.warns(UserWarning, match=said):
+        model = ReptilePPO("ProgPolicy", gravity_env, tasks=tasks, n_envs=2, tasks_per_iteration=2, **SMALL)
+    model.learn(64)
+    assert model.tasks.success_rates.tolist() == [0.0, 1.0]
+    model.save(tmp_path / "model.zip")
+    ReptilePPO.load(tmp_path / "model.zip", env=gravity_env).learn(64)
+    config = make_config("ppo", gravity_env, 0, overrides={"tasks": [{"gravity": 1.0}, {"gravity": 2.0}]})
+    with pytest.warns(UserWarning, match=said):
+        assert build_model(config)[1].tasks.apply == "constructor"
+    rows = evaluate_program(model.program(), gravity_env, [{"gravity": 1.0}, {"gravity": 2.0}], n_episodes=2)
+    assert [row.success_rate for row in rows] == [0.0, 1.0]
+
+
+def test_evaluation_of_a_variation_that_nothing_reads_is_an_error(gravity_env):
+    program = ReptilePPO("ProgPolicy", gravity_env, n_envs=2, **SMALL).program()
+    with pytest.raises(ValueError, match="the reset option mass has no effect"):
+        evaluate_program(program, gravity_env, [{"mass": 1.0}], n_episodes=2)
 
 
 def test_labels_are_short_unique_and_rounded():

@@ -36,8 +36,7 @@ from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.reptile.callback import ReptileWrapper
 from sb3_progpolicy.reptile.checkpoint import ReptileCheckpoint, load_last_good, previous_of
 from sb3_progpolicy.reptile.tasks import TaskDistribution, default_tasks
-from sb3_progpolicy.reptile_ppo.environments import DEFAULT_N_ENVS
-from sb3_progpolicy.vec_env import make_fast_vec_env
+from sb3_progpolicy.reptile_ppo.environments import make_venv
 from sb3_progpolicy.vec_env.worker import WorkerDiedError, interrupts_deferred
 
 
@@ -74,14 +73,21 @@ def build_model(
 
 
 def _reptile_wrapper(config: RunConfig, arguments: dict[str, Any]) -> ReptileWrapper:
-    tasks = arguments.pop("tasks", None)
-    return ReptileWrapper(default_tasks(config.env) if tasks is None else TaskDistribution(tasks), **arguments)
+    arguments.pop("tasks", None)
+    return ReptileWrapper(_tasks(config), **arguments)
+
+
+def _tasks(config: RunConfig) -> TaskDistribution:
+    """Return the tasks of a configuration in the form that has an effect on its environment."""
+    tasks = config.hyperparams.get("tasks")
+    distribution = default_tasks(config.env) if tasks is None else TaskDistribution(tasks)
+    return distribution.fit_to(config.env, config.env_kwargs)
 
 
 def make_env(config: RunConfig) -> VecEnv:
     """Make the training environments of a configuration."""
-    n_envs = config.hyperparams.get("n_envs", DEFAULT_N_ENVS)
-    env = make_fast_vec_env(config.env, n_envs, config.seed, **config.env_kwargs)
+    remade = _tasks(config).apply == "constructor"
+    env = make_venv(config.env, config.hyperparams.get("n_envs"), config.seed, config.env_kwargs, remade)
     # An algorithm that has Reptile appends the history by itself.
     if not METHODS[config.algo].has_reptile and config.hyperparams.get("interaction_history", False):
         return VecInteractionHistory(env)

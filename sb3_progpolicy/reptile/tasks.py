@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from progpolicy_envs import find_domain
+from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, unread_names
 
 Variation = dict[str, Any]
 Draw = Callable[[np.random.Generator], Any]
@@ -233,6 +235,28 @@ class TaskDistribution:
             for index, label in enumerate(labels)
         ]
 
+    def fit_to(self, env_id: str, env_kwargs: Mapping[str, Any] | None = None) -> TaskDistribution:
+        """Return the distribution in the form that has an effect on an environment, which is this one as a rule.
+
+        Where the environment reads none of a parameter's reset options and its constructor has all parameters, that
+        is the one with ``apply="constructor"``, and a warning says so.
+
+        :param env_id: environment id
+        :param env_kwargs: constructor arguments
+        """
+        if self.apply != "options" or not self.variations[0] or find_domain(env_id) is not None:
+            return self
+        (_, drawn), *_ = self.sample(np.random.default_rng(0))
+        unread = constructor_arguments(env_id, drawn, env_kwargs or {})
+        if not unread or unread != set(drawn):
+            return self
+        warnings.warn(
+            f"{env_id} does not read the reset option {', '.join(sorted(unread))}, and its constructor has such an "
+            "argument: each task makes the environments anew (apply='constructor')",
+            stacklevel=3,
+        )
+        return TaskDistribution(self.variations, self.sampler, "constructor", self.check)
+
     def put_in_force(self, env: VecEnv, variations: Sequence[Variation]) -> None:
         """Make the variations those that the next reset of ``env`` starts with.
 
@@ -241,7 +265,7 @@ class TaskDistribution:
         :raises ValueError: if the environments cannot be varied in this way
         """
         if self.apply == "options":
-            env.set_options([_Options(variation) for variation in variations])
+            env.set_options([ReadOptions(variation) for variation in variations])
             return
         for row, variation in enumerate(variations):
             if self.apply == "constructor":
@@ -268,9 +292,7 @@ class TaskDistribution:
 
     def _check_noticed(self, env: VecEnv, options: Sequence[Any]) -> None:
         """Raise an error if no environment has looked at an option, so that training would go on unchanged."""
-        if not all(isinstance(given, _Options) and not given.sent for given in options):
-            return  # copied or sent to another process, where nobody can look
-        unread = set(self.variations[0]).difference(*(given.read for given in options))
+        unread = unread_names(options)
         if unread:
             names = ", ".join(sorted(unread))
             raise ValueError(
@@ -278,46 +300,6 @@ class TaskDistribution:
                 "variation are apply='attributes', for what the environment keeps in attributes, and "
                 "apply='constructor', with each environment wrapped in RemakeOnVariation"
             )
-
-
-class _Options(dict[str, Any]):
-    """Reset options that know which of them have been read."""
-
-    def __init__(self, variation: Variation) -> None:
-        super().__init__(variation)
-        self.read: set[str] = set()
-        self.sent = False
-
-    def __getitem__(self, name: str) -> Any:
-        self.read.add(name)
-        return super().__getitem__(name)
-
-    def get(self, name: str, default: Any = None) -> Any:
-        self.read.add(name)
-        return super().get(name, default)
-
-    def pop(self, name: str, *default: Any) -> Any:
-        self.read.add(name)
-        return super().pop(name, *default)
-
-    def keys(self) -> Any:
-        self.read.update(super().keys())
-        return super().keys()
-
-    def items(self) -> Any:
-        self.read.update(super().keys())
-        return super().items()
-
-    def __iter__(self) -> Iterator[str]:
-        self.read.update(super().keys())
-        return super().__iter__()
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> _Options:  # SB3 copies options
-        return self
-
-    def __reduce__(self) -> tuple[Any, ...]:  # for another process
-        self.sent = True
-        return dict, (dict(super().items()),)
 
 
 def default_tasks(env_id: str | None) -> TaskDistribution:

@@ -179,9 +179,14 @@ class ReptilePPO(StoredPPO):
         self.env_id = env if isinstance(env, str) else env_id_of(env)
         self.interaction_history = interaction_history
         self.env_kwargs = dict(env_kwargs or {})
+        if tasks is None:
+            tasks = default_tasks(self.env_id)
+        tasks = tasks if isinstance(tasks, TaskDistribution) else TaskDistribution(tasks)
+        self.tasks = tasks.fit_to(env, env_kwargs) if isinstance(env, str) else tasks
         venv = None
         if env is not None:
-            venv = with_history(make_venv(env, n_envs, seed, env_kwargs or {}), interaction_history)
+            remade = self.tasks.apply == "constructor"
+            venv = with_history(make_venv(env, n_envs, seed, env_kwargs or {}, remade), interaction_history)
         if batch_size is None:
             batch_size = default_batch_size(n_steps, 1 if venv is None else venv.num_envs)
         policy_class = self._get_policy_from_name(policy) if isinstance(policy, str) else policy
@@ -190,9 +195,6 @@ class ReptilePPO(StoredPPO):
         policy_kwargs = dict(policy_kwargs or {})
         if normalize_observations:
             policy_kwargs.setdefault("features_extractor_class", NormalizingExtractor)
-        if tasks is None:
-            tasks = default_tasks(self.env_id)
-        self.tasks = tasks if isinstance(tasks, TaskDistribution) else TaskDistribution(tasks)
         self.inner_updates, self.tasks_per_iteration = inner_updates, tasks_per_iteration
         self.meta_learning_rate = meta_learning_rate
         self.meta_optimizer, self.meta_update = meta_optimizer, meta_update
@@ -398,5 +400,6 @@ class ReptilePPO(StoredPPO):
         :param force_reset: see SB3's ``BaseAlgorithm.set_env``
         """
         self.env_by_id = made = isinstance(env, str)
-        venv = make_venv(env, self.n_envs if made else None, self.seed, self.env_kwargs if made else {})
+        remade = self.tasks.apply == "constructor"
+        venv = make_venv(env, self.n_envs if made else None, self.seed, self.env_kwargs if made else {}, remade)
         super().set_env(with_history(venv, self.interaction_history), force_reset)

@@ -3,29 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
 
 from sb3_progpolicy.interaction import InteractionHistory, VecInteractionHistory
+from sb3_progpolicy.reptile.tasks import RemakeOnVariation
 from sb3_progpolicy.vec_env import make_fast_vec_env
 
 DEFAULT_N_ENVS = 32
 
 
-def make_venv(env: GymEnv | str, n_envs: int | None, seed: int | None, env_kwargs: Mapping[str, Any]) -> VecEnv:
+def make_venv(
+    env: GymEnv | str, n_envs: int | None, seed: int | None, env_kwargs: Mapping[str, Any], remade: bool = False
+) -> VecEnv:
     """Return the environments of an id in their fastest form, or those given as a ``VecEnv``.
 
     :param env: an id, an environment or a ``VecEnv``
     :param n_envs: how many to make of an id; :data:`DEFAULT_N_ENVS` by default
     :param seed: of the environments of an id
     :param env_kwargs: constructor arguments for an id
+    :param remade: whether each of an id's is to be made anew for a variation, in :class:`RemakeOnVariation`
     :raises ValueError: for ``n_envs`` or ``env_kwargs`` with an environment that is made already
     """
     if isinstance(env, str):
-        return make_fast_vec_env(env, DEFAULT_N_ENVS if n_envs is None else n_envs, seed, **env_kwargs)
+        number = DEFAULT_N_ENVS if n_envs is None else n_envs
+        if remade:
+            return make_vec_env(partial(RemakeOnVariation, env, **env_kwargs), number, seed)
+        return make_fast_vec_env(env, number, seed, **env_kwargs)
     if n_envs is not None or env_kwargs:
         raise ValueError("n_envs and env_kwargs are for environment ids; the environment given is already made")
     return PPO._wrap_env(env)

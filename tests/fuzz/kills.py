@@ -14,19 +14,22 @@ import numpy as np
 import torch as th
 
 from sb3_progpolicy.reptile.checkpoint import previous_of
-from tests.test_resume import assert_same_bits, make, parameters, start, train
+from tests.test_resume import TIMESTEPS, assert_same_bits, make, parameters, start, train
 
-TRAIN = "train(make('ProgPolicy'), Path({0!r}))"
-RESUME = "train(load_last_good({0!r}, ReptilePPO.load, env='Hanoi-v0'), Path({0!r}))"
+STEPS = 4 * TIMESTEPS  # long enough for a kill at a random moment to come before the end
+TRAIN = f"train(make('ProgPolicy'), Path({{0!r}}), timesteps={STEPS})"
+RESUME = f"train(load_last_good({{0!r}}, ReptilePPO.load, env='Hanoi-v0'), Path({{0!r}}), timesteps={STEPS})"
+MAX_TRIES = 10
 
 
 @lru_cache
-def uninterrupted() -> dict[str, Any]:
-    """The parameters at the end of a training that nothing stopped."""
+def uninterrupted() -> tuple[dict[str, Any], float]:
+    """The parameters at the end of a training that nothing stopped, and its seconds."""
     th.set_num_threads(1)
     folder = Path(tempfile.mkdtemp())
     try:
-        return train(make("ProgPolicy"), folder / "model.zip")
+        started = time.monotonic()
+        return train(make("ProgPolicy"), folder / "model.zip", timesteps=STEPS), time.monotonic() - started
     finally:
         shutil.rmtree(folder)
 
@@ -34,21 +37,28 @@ def uninterrupted() -> dict[str, Any]:
 def case(rng: np.random.Generator, folder: Path) -> str:
     """Kill a training after a random time past its first checkpoint, resume it, and compare the ends.
 
+    A kill that comes after the end is made again, earlier.
+
     :raises AssertionError: if a parameter differs, or a half-written checkpoint cannot be loaded
     """
-    expected, path = uninterrupted(), folder / "model.zip"
-    process = start(TRAIN.format(str(path)))
-    while not path.is_file():
-        assert process.poll() is None, f"training ended with {process.returncode} before its first checkpoint"
-        time.sleep(0.005)
-    time.sleep(float(rng.uniform(0, 1)))
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
-    outcome = "killed after its end" if path.with_suffix(".final.zip").exists() else "killed and resumed"
-    if outcome == "killed and resumed":
-        resumed = start(RESUME.format(str(path)))
-        resumed.communicate(timeout=120)
-        assert resumed.returncode == 0, f"resuming ended with {resumed.returncode}"
-        assert previous_of(path).exists()
+    (expected, seconds), path = uninterrupted(), folder / "model.zip"
+    for _ in range(MAX_TRIES):
+        shutil.rmtree(folder)
+        folder.mkdir()
+        killed = start(TRAIN.format(str(path)))
+        while not path.is_file():
+            assert killed.poll() is None, f"training ended with {killed.returncode} before its first checkpoint"
+            time.sleep(0.005)
+        time.sleep(float(rng.uniform(0, seconds)))
+        killed.send_signal(signal.SIGKILL)
+        killed.communicate()
+        if not path.with_suffix(".final.zip").exists():
+            break
+    else:
+        raise AssertionError(f"{MAX_TRIES} trainings ended within {seconds:.1f} s of their first checkpoint")
+    resumed = start(RESUME.format(str(path)))
+    resumed.communicate(timeout=120)
+    assert resumed.returncode == 0, f"resuming ended with {resumed.returncode}"
+    assert previous_of(path).exists()
     assert_same_bits(expected, parameters(path))
-    return outcome
+    return "killed and resumed"

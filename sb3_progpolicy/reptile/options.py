@@ -1,0 +1,106 @@
+"""Reset options that know whether they have been read, and what to do where an environment reads none."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterable, Iterator, Mapping
+from importlib import import_module
+from typing import Any
+
+import gymnasium as gym
+
+
+class ReadOptions(dict[str, Any]):
+    """Reset options that know which of them have been read.
+
+    :param variation: the options
+    """
+
+    def __init__(self, variation: Mapping[str, Any]) -> None:
+        super().__init__(variation)
+        self.read: set[str] = set()
+        self.sent = False  # copied to another process, where nobody can look
+
+    def __getitem__(self, name: str) -> Any:
+        self.read.add(name)
+        return super().__getitem__(name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """See ``dict.get``."""
+        self.read.add(name)
+        return super().get(name, default)
+
+    def pop(self, name: str, *default: Any) -> Any:
+        """See ``dict.pop``."""
+        self.read.add(name)
+        return super().pop(name, *default)
+
+    def keys(self) -> Any:
+        """See ``dict.keys``; who asks for all names is taken to read all."""
+        self.read.update(super().keys())
+        return super().keys()
+
+    def items(self) -> Any:
+        """See ``dict.items``; who asks for all is taken to read all."""
+        self.read.update(super().keys())
+        return super().items()
+
+    def __iter__(self) -> Iterator[str]:
+        self.read.update(super().keys())
+        return super().__iter__()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> ReadOptions:  # SB3 copies options
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:  # for another process
+        self.sent = True
+        return dict, (dict(super().items()),)
+
+
+def unread_names(options: Iterable[Any]) -> set[str]:
+    """Return the names that no environment has read; none where that cannot be known.
+
+    :param options: what each environment was given, after its reset
+    """
+    given = list(options)
+    if not given or not all(isinstance(one, ReadOptions) and not one.sent for one in given):
+        return set()
+    return set(dict.keys(given[0])).difference(*(one.read for one in given))
+
+
+def constructor_arguments(env_id: str, variation: Mapping[str, Any], env_kwargs: Mapping[str, Any]) -> set[str]:
+    """Return which parameters of a variation the constructor takes and no reset reads.
+
+    :param env_id: a registered id, with or without a module prefix
+    :param variation: parameters and values
+    :param env_kwargs: constructor arguments of the environment that is tried
+    """
+    if not variation:
+        return set()
+    taken = set(variation) & _constructor_parameters(env_id)
+    if not taken:
+        return set()
+    env = gym.make(env_id, **env_kwargs)
+    try:
+        options = ReadOptions(variation)
+        env.reset(seed=0, options=options)
+    finally:
+        env.close()
+    return taken & unread_names([options])
+
+
+def _constructor_parameters(env_id: str) -> set[str]:
+    """Return the names of the constructor's parameters; none where it cannot be asked."""
+    module, _, name = env_id.rpartition(":")
+    if module:
+        import_module(module)
+    entry_point: Any = gym.spec(name).entry_point
+    if isinstance(entry_point, str):
+        try:
+            entry_point = gym.envs.registration.load_env_creator(entry_point)
+        except (ImportError, AttributeError):
+            return set()
+    try:
+        return set(inspect.signature(entry_point).parameters)
+    except (TypeError, ValueError):
+        return set()
