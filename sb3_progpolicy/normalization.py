@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -9,6 +11,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
+from progpolicy_envs.symmetry import Permutation
 from sb3_progpolicy.differentiable.module import ProgramModule
 
 EPSILON = 1e-8
@@ -32,6 +35,14 @@ class NormalizingExtractor(BaseFeaturesExtractor):
         self.register_buffer("mean", th.zeros(n_features, dtype=th.float64))
         self.register_buffer("variance", th.ones(n_features, dtype=th.float64))
         self.register_buffer("count", th.tensor(EPSILON, dtype=th.float64))
+        self._group: Sequence[Permutation] = ()
+
+    def tie(self, group: Sequence[Permutation]) -> None:
+        """Keep the statistics those of all images of the observations, so that a tied program stays one.
+
+        :param group: how its members move the observation
+        """
+        self._group = tuple(group)
 
     @property
     def scale(self) -> th.Tensor:
@@ -48,8 +59,13 @@ class NormalizingExtractor(BaseFeaturesExtractor):
         statistics.mean, statistics.var = self.mean.cpu().numpy(), self.variance.cpu().numpy()
         statistics.count = float(self.count)
         statistics.update(np.asarray(observations, dtype=np.float64))
-        self.mean.copy_(th.as_tensor(statistics.mean))
-        self.variance.copy_(th.as_tensor(statistics.var))
+        mean, variance = statistics.mean, statistics.var
+        if self._group:
+            squares = np.mean([(mean**2 + variance)[list(one.source)] for one in self._group], axis=0)
+            mean = np.mean([one(mean) for one in self._group], axis=0)
+            variance = np.maximum(squares - mean**2, 0)
+        self.mean.copy_(th.as_tensor(mean))
+        self.variance.copy_(th.as_tensor(variance))
         self.count.fill_(statistics.count)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from progpolicy_envs.symmetry import Grid, Permutation, Symmetry, group_of
+from progpolicy_envs.symmetry import Grid, Symmetry, group_of
 from sb3_progpolicy.programs.syntax import ProgramData
+from sb3_progpolicy.symmetries import matrix_of, on_inputs
 
 Floats = NDArray[np.float64]
 
@@ -71,19 +72,9 @@ def _add(found: list[Term], span: Floats, pattern: Floats, group: Sequence[tuple
 def _on_inputs(program: ProgramData, symmetry: Symmetry) -> Floats:
     """Return the matrix of a symmetry on X and the constant."""
     matrix = np.eye(program.n_inputs + 1)
-    n = program.n_observations
-    matrix[:n, :n] = _matrix(symmetry.observation)
-    if program.interaction:
-        end = n + program.action.history_size
-        matrix[n:end, n:end] = _matrix(symmetry.action)
+    matrix[:-1, :-1] = matrix_of(on_inputs(symmetry, program.n_inputs, program.action))
     return matrix
 
 
 def _on_outputs(symmetry: Symmetry, n_outputs: int) -> Floats:
-    return _matrix(symmetry.action) if n_outputs == len(symmetry.action.source) else np.eye(n_outputs)
-
-
-def _matrix(permutation: Permutation) -> Floats:
-    matrix = np.zeros((len(permutation.source),) * 2)
-    matrix[np.arange(len(permutation.source)), list(permutation.source)] = permutation.signs
-    return matrix
+    return matrix_of(symmetry.action) if n_outputs == len(symmetry.action.source) else np.eye(n_outputs)

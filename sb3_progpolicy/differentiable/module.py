@@ -7,134 +7,19 @@ their conditions and then-controllers.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, cast
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch as th
 from torch import nn
 
-from sb3_progpolicy.differentiable.recurrence import scan
+from progpolicy_envs.symmetry import Symmetry
+from sb3_progpolicy.differentiable.conditions import Conditions, State, matrix, vector
 from sb3_progpolicy.differentiable.search import DerivationSearch
-from sb3_progpolicy.programs.syntax import GATES, Cell, Condition, Controller, Expression, IfThenElse
+from sb3_progpolicy.differentiable.tied import TiedLinear
+from sb3_progpolicy.programs.syntax import BOX_SEMANTICS, BoxSemantics, Cell, Controller, Expression, IfThenElse
 from sb3_progpolicy.spaces import ActionSpec
-
-State = tuple[th.Tensor, th.Tensor]
-
-_LAYERS: dict[Cell, Callable[[int, int], nn.RNNBase]] = {"rnn": nn.RNN, "gru": nn.GRU, "lstm": nn.LSTM}
-CELLS: tuple[Cell, ...] = ("affine", *_LAYERS)
-
-
-class Conditions(nn.Module):
-    """All conditions ``B_1 ... B_K`` of a program in one recurrent layer.
-
-    The recurrent matrix is block-diagonal: entries between the units of different conditions are zero and get no
-    gradient, so that each condition has a state of its own while one fused kernel computes them all.
-
-    The module is called like ``torch.nn.LSTM`` whatever the cell, so that sb3-contrib's sequence handling can run
-    it; cells without a second state pass it through.
-
-    :param n_inputs: length of X
-    :param n_conditions: K, 0 or more
-    :param cell: ``"gru"``, ``"lstm"``, ``"rnn"``, or ``"affine"`` for conditions without a state
-    :param size: hidden units per condition, at least 1
-    """
-
-    num_layers = 1
-
-    def __init__(self, n_inputs: int, n_conditions: int, cell: Cell = "gru", size: int = 1) -> None:
-        super().__init__()
-        if cell not in CELLS:
-            raise ValueError(f"cell={cell!r} is not accepted; known cells: {', '.join(CELLS)}")
-        if size < 1:
-            raise ValueError(f"condition size {size} is not accepted; it is at least 1")
-        self.input_size, self.n_conditions, self.cell, self.size = n_inputs, n_conditions, cell, size
-        self.recurrent = cell != "affine" and n_conditions > 0
-        # SB3 keeps states as arrays of this width; it cannot be 0.
-        self.hidden_size = n_conditions * size if self.recurrent else 1
-        if self.recurrent:
-            self.rnn = _LAYERS[cell](n_inputs, self.hidden_size)
-            self._make_block_diagonal()
-            self.readout = nn.Parameter(th.ones(n_conditions, size) / size**0.5)
-            self.readout_bias = nn.Parameter(th.zeros(n_conditions))
-        elif n_conditions:
-            self.affine = nn.Linear(n_inputs, n_conditions)
-
-    def _make_block_diagonal(self) -> None:
-        blocks = th.block_diag(*[th.ones(self.size, self.size)] * self.n_conditions)
-        mask = blocks.repeat(len(GATES[self.cell]), 1)
-        weight = cast(nn.Parameter, self.rnn.weight_hh_l0)
-        with th.no_grad():
-            weight.mul_(mask)
-        weight.register_hook(lambda gradient: gradient * mask.to(gradient.device))
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a copied module; torch copies no hooks, so that the block structure is set anew."""
-        super().__setstate__(state)
-        if self.recurrent:
-            self._make_block_diagonal()
-
-    def forward(self, inputs: th.Tensor, state: State) -> tuple[th.Tensor, State]:
-        """Compute every B for a sequence.
-
-        :param inputs: X, ``(n_steps, n_sequences, n_inputs)``
-        :param state: two tensors ``(1, n_sequences, hidden_size)``
-        :return: B, ``(n_steps, n_sequences, n_conditions)``, and the state after the last step
-        """
-        if not self.n_conditions:
-            return inputs.new_zeros(*inputs.shape[:-1], 0), state
-        if not self.recurrent:
-            return self.affine(inputs), state
-        if self.cell == "lstm":
-            hidden, state = self.rnn(inputs, state)
-        elif inputs.device.type == "cpu" and inputs.dtype == th.float32:
-            hidden = self._scan(inputs, state[0][0])
-            state = (hidden[-1:], state[1])
-        else:
-            hidden, last = self.rnn(inputs, state[0])
-            state = (last, state[1])
-        units = hidden.unflatten(-1, (self.n_conditions, self.size))
-        return (units * self.readout).sum(-1) + self.readout_bias, state
-
-    def _scan(self, inputs: th.Tensor, hidden: th.Tensor) -> th.Tensor:
-        names = ("weight_ih_l0", "bias_ih_l0", "weight_hh_l0", "bias_hh_l0")
-        input_weight, input_bias, weight, bias = (cast(th.Tensor, getattr(self.rnn, name)) for name in names)
-        return scan(self.cell, nn.functional.linear(inputs, input_weight, input_bias), weight, bias, hidden)
-
-    def to_syntax(self, k: int) -> Condition:
-        """Return condition ``k`` (0-based) as plain data."""
-        if not self.recurrent:
-            weight, bias = self.affine.weight[k], self.affine.bias[k]
-            return Condition("affine", (), (), (), (), _vector(weight), bias.item())
-        n_gates = len(GATES[self.cell])
-        rows = slice(k * self.size, (k + 1) * self.size)
-
-        def gates(parameter: th.Tensor | nn.Module) -> th.Tensor:
-            return cast(th.Tensor, parameter).unflatten(0, (n_gates, self.hidden_size))[:, rows].flatten(0, 1)
-
-        return Condition(
-            cell=self.cell,
-            weight_ih=_matrix(gates(self.rnn.weight_ih_l0)),
-            weight_hh=_matrix(gates(self.rnn.weight_hh_l0)[:, rows]),
-            bias_ih=_vector(gates(self.rnn.bias_ih_l0)),
-            bias_hh=_vector(gates(self.rnn.bias_hh_l0)),
-            readout=_vector(self.readout[k]),
-            readout_bias=self.readout_bias[k].item(),
-        )
-
-    def keep(self, n_conditions: int) -> Conditions:
-        """Return a module of the first ``n_conditions`` conditions alone, with copies of their parameters."""
-        kept = Conditions(self.input_size, n_conditions, self.cell, self.size)
-        rows = slice(0, n_conditions * self.size)
-        with th.no_grad():
-            for name, parameter in kept.named_parameters():
-                source: th.Tensor = self.get_parameter(name)
-                if name.startswith("rnn."):
-                    source = source.unflatten(0, (len(GATES[self.cell]), self.hidden_size))[:, rows].flatten(0, 1)
-                    source = source[:, rows] if name == "rnn.weight_hh_l0" else source
-                else:
-                    source = source[:n_conditions]
-                parameter.copy_(source)
-        return kept
+from sb3_progpolicy.symmetries import Group
 
 
 class ProgramModule(nn.Module):
@@ -145,7 +30,8 @@ class ProgramModule(nn.Module):
     from W and its branches, drawn from the sigmoids, lead to that controller. One cumulative product over the
     conditions and one over the choices give all mixture weights in O(depth).
 
-    For discrete actions the controllers' action probabilities are mixed, for Box actions their values.
+    For discrete actions the controllers' action probabilities are mixed. For Box actions it is their values, or, with
+    ``semantics="branches"``, the densities of Gaussians around them.
 
     :param n_inputs: length of X
     :param action: the action space
@@ -153,6 +39,9 @@ class ProgramModule(nn.Module):
     :param cell: see :class:`Conditions`
     :param condition_size: hidden units per condition
     :param temperature: of the sigmoid, above 0; towards 0 the soft semantics becomes the crisp one
+    :param semantics: of Box actions, ``"means"`` or ``"branches"``
+    :param symmetries: generators of a group that is to leave the program as it is: all weights of a controller that are
+        one another's images are one number, and conditions read the mean of X over the group
     """
 
     def __init__(
@@ -163,17 +52,37 @@ class ProgramModule(nn.Module):
         cell: Cell = "gru",
         condition_size: int = 1,
         temperature: float = 1.0,
+        semantics: BoxSemantics = "means",
+        symmetries: Sequence[Symmetry | Mapping[str, Any]] = (),
     ) -> None:
         super().__init__()
         if depth < 1:
             raise ValueError(f"depth={depth} is not accepted; a derivation graph has at least 1 layer")
+        if semantics not in BOX_SEMANTICS:
+            raise ValueError(f"semantics={semantics!r} is not accepted; it is one of {', '.join(BOX_SEMANTICS)}")
+        self.semantics: BoxSemantics = semantics
+        self.group = Group(symmetries, n_inputs, action) if symmetries else None
         self.n_inputs, self.action, self.depth = n_inputs, action, depth
-        self.conditions = Conditions(n_inputs, depth - 1, cell, condition_size)
+        projection = None if self.group is None else th.from_numpy(self.group.mean_of_inputs())
+        self.conditions = Conditions(n_inputs, depth - 1, cell, condition_size, projection)
         # Rows: the then-controllers C'_1 ... C'_K, then the last controllers C_1 ... C_depth.
-        self.controllers = nn.Linear(n_inputs, (2 * depth - 1) * action.n_outputs)
+        n_controllers = 2 * depth - 1
+        self.controllers: nn.Linear | TiedLinear = (
+            nn.Linear(n_inputs, n_controllers * action.n_outputs)
+            if self.group is None
+            else TiedLinear(self.group.ties(), n_controllers)
+        )
         self.search = DerivationSearch(depth)
         self.temperature: th.Tensor
         self.register_buffer("temperature", th.tensor(float(temperature)))
+        #: Logits of discrete actions are divided by it; the crisp program's choice does not depend on it.
+        self.action_temperature: th.Tensor
+        self.register_buffer("action_temperature", th.tensor(1.0))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        """Load a state dict; one of release 0.1 has no action temperature, which was 1."""
+        state_dict.setdefault(f"{prefix}action_temperature", th.ones_like(self.action_temperature))
+        super()._load_from_state_dict(state_dict, prefix, *args)  # type: ignore[no-untyped-call]
 
     @property
     def n_controllers(self) -> int:
@@ -221,8 +130,12 @@ class ProgramModule(nn.Module):
         :param inputs: X, ``(..., n_inputs)``
         :param mixture_weights: ``(..., n_in_use)``
         :return: ``(..., n_outputs)``: means for Box, log-probabilities for Discrete and MultiDiscrete (per component),
-            log-odds for MultiBinary
+            log-odds for MultiBinary; with branches, ``(..., n_in_use * (1 + n_outputs))``: the logarithms of the
+            weights, then the controllers' outputs
         """
+        if self.mixes_branches:
+            outputs = self._terms(inputs).permute(2, 0, 1).flatten(1).unflatten(0, inputs.shape[:-1])
+            return th.cat((_log(mixture_weights), outputs), dim=-1)
         weights = mixture_weights.flatten(0, -2).T.unsqueeze(1)
         mixed = (weights * self._terms(inputs)).sum(0)
         return self._to_parameters(mixed.T.unflatten(0, inputs.shape[:-1]))
@@ -232,17 +145,23 @@ class ProgramModule(nn.Module):
 
         :param inputs: X, ``(n, n_inputs)``
         :param condition_values: the values of B, ``(n, depth - 1)``
-        :return: ``(n, n_terms, n_in_use)``, for :meth:`mix_derivation`
+        :return: for :meth:`mix_derivation`: ``(n, n_terms, n_in_use)``, or with branches
+            ``(n, n_in_use * (1 + n_outputs))``
         """
+        if self.mixes_branches:
+            outputs = self._terms(inputs).permute(2, 0, 1).flatten(1)
+            return th.cat((self.path_probabilities(condition_values), outputs), dim=1)
         terms = self.path_probabilities(condition_values).T.unsqueeze(1) * self._terms(inputs)
         return terms.permute(2, 1, 0).contiguous()
 
     def mix_derivation(self, terms: th.Tensor) -> th.Tensor:
         """Return what :meth:`mix` returns.
 
-        :param terms: from :meth:`derivation_terms`, ``(n, n_terms, n_in_use)``
-        :return: ``(n, n_outputs)``
+        :param terms: from :meth:`derivation_terms`
         """
+        if self.mixes_branches:
+            choices = self.choices()
+            return th.cat((_log(terms[:, : len(choices)] * choices), terms[:, len(choices) :]), dim=1)
         return self._to_parameters(terms @ self.choices())
 
     def _terms(self, inputs: th.Tensor) -> th.Tensor:
@@ -250,7 +169,7 @@ class ProgramModule(nn.Module):
 
         Rows come last: softmax and sums then run along contiguous memory, twice as fast as over a last axis of a few.
         """
-        weight, bias, in_use = self.controllers.weight, self.controllers.bias, self.controllers_in_use
+        (weight, bias), in_use = self.controller_parameters(), self.controllers_in_use
         if len(in_use) < self.n_controllers:
             rows = th.tensor(in_use, device=weight.device)
             weight, bias = (
@@ -265,6 +184,54 @@ class ProgramModule(nn.Module):
         if self.action.kind == "discrete":
             return outputs.softmax(1)
         return th.cat([component.softmax(1) for component in outputs.split(list(self.action.sizes), dim=1)], dim=1)
+
+    @property
+    def mixes_branches(self) -> bool:
+        """Whether the actions are drawn from a mixture of Gaussians."""
+        return self.action.kind == "box" and self.semantics == "branches"
+
+    def controller_parameters(self) -> tuple[th.Tensor, th.Tensor]:
+        """Return weights and biases of all controllers, of logits by the action temperature."""
+        weight, bias = self.controllers.weight, self.controllers.bias
+        if self.action.kind == "box":
+            return weight, bias
+        return weight / self.action_temperature, bias / self.action_temperature
+
+    @th.no_grad()
+    def crisp_controllers(self, condition_values: th.Tensor) -> th.Tensor:
+        """Return which of the controllers in use decides in the most likely program, run crisp, ``(n,)``.
+
+        :param condition_values: the values of B, ``(n, depth - 1)``
+        """
+        n_conditions = self.search.most_likely()
+        taken = condition_values[:, :n_conditions] >= 0
+        last = self.depth - 1 + n_conditions if self.search.searching else n_conditions
+        first = taken.to(th.int8).argmax(1) if n_conditions else taken.new_zeros(len(taken), dtype=th.long)
+        return th.where(taken.any(1), first, last)
+
+    @th.no_grad()
+    def crisp_disagreement(self, inputs: th.Tensor, condition_values: th.Tensor) -> float:
+        """Return the share of steps on which the soft program's most likely action is not the crisp program's.
+
+        For Box actions it is the share on which the most likely controller is not the one that decides.
+
+        :param inputs: X, ``(n, n_inputs)``
+        :param condition_values: the values of B, ``(n, depth - 1)``
+        """
+        weights, crisp = self.mixture_weights(condition_values), self.crisp_controllers(condition_values)
+        if self.action.kind == "box":
+            return (weights.argmax(1) != crisp).float().mean().item()
+        terms = self._terms(inputs)
+        soft = self._modes((weights.T.unsqueeze(1) * terms).sum(0))
+        own = self._modes(terms.permute(2, 0, 1)[th.arange(len(crisp), device=crisp.device), crisp].T)
+        return (soft != own).any(0).float().mean().item()
+
+    def _modes(self, probabilities: th.Tensor) -> th.Tensor:
+        """Return the most likely choice of each component, ``(n_components, n)``, of terms ``(n_terms, n)``."""
+        if self.action.kind == "multi_binary":
+            on, off = probabilities.chunk(2)
+            return on >= off
+        return th.stack([part.argmax(0) for part in probabilities.split(list(self.action.sizes))])
 
     def _to_parameters(self, mixed: th.Tensor) -> th.Tensor:
         """Turn mixed terms ``(..., n_terms)`` into the parameters of the action distribution."""
@@ -310,6 +277,7 @@ class ProgramModule(nn.Module):
             self.conditions.cell,
             self.conditions.size,
             float(self.temperature),
+            self.semantics,
         ).to(self.controllers.weight.device)
         module.conditions = self.conditions.keep(n_conditions).to(self.controllers.weight.device)
         # In the new graph only the deepest program is drawn, so only its controllers need values.
@@ -318,8 +286,8 @@ class ProgramModule(nn.Module):
             module.controllers.weight.zero_()
             module.controllers.bias.zero_()
             targets = module._controller_rows(n_conditions)
-            for name in ("weight", "bias"):
-                blocks = self.controllers.get_parameter(name).unflatten(0, (self.n_controllers, -1))
+            for name, values in zip(("weight", "bias"), self.controller_parameters(), strict=True):
+                blocks = values.unflatten(0, (self.n_controllers, -1))
                 module.controllers.get_parameter(name).unflatten(0, (module.n_controllers, -1))[targets] = blocks[rows]
         module.search.select(n_conditions)
         return module
@@ -330,10 +298,9 @@ class ProgramModule(nn.Module):
         :param n_conditions: which program; the most likely one under W if ``None``
         """
         n_conditions = self.search.most_likely() if n_conditions is None else n_conditions
-        weights = self.controllers.weight.unflatten(0, (self.n_controllers, -1))
-        biases = self.controllers.bias.unflatten(0, (self.n_controllers, -1))
+        weights, biases = (values.unflatten(0, (self.n_controllers, -1)) for values in self.controller_parameters())
         *then, last = (
-            Controller(_matrix(weights[row]), _vector(biases[row])) for row in self._controller_rows(n_conditions)
+            Controller(matrix(weights[row]), vector(biases[row])) for row in self._controller_rows(n_conditions)
         )
         expression: Expression = last
         for k in reversed(range(n_conditions)):
@@ -347,11 +314,3 @@ class ProgramModule(nn.Module):
 
 def _log(probabilities: th.Tensor) -> th.Tensor:
     return th.log(probabilities.clamp_min(th.finfo(probabilities.dtype).tiny))
-
-
-def _vector(values: th.Tensor) -> tuple[float, ...]:
-    return tuple(values.detach().tolist())
-
-
-def _matrix(values: th.Tensor) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(row) for row in values.detach().tolist())

@@ -8,7 +8,8 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 
-from sb3_progpolicy.differentiable.module import ProgramModule, State
+from sb3_progpolicy.differentiable.conditions import State
+from sb3_progpolicy.differentiable.module import ProgramModule
 from sb3_progpolicy.programs.cells import STEPS, Array, sigmoid
 
 
@@ -16,8 +17,8 @@ class ProgramSampler:
     """Runs a :class:`ProgramModule` for ``n_steps`` steps in a batch of environments and samples actions.
 
     It computes what the module computes under the soft semantics, W included, keeps the states of the conditions
-    from one step to the next and records the values of the conditions. Box actions need the mixture; all others are
-    drawn by drawing a program from W and running it, with a random choice at every branch.
+    from one step to the next and records the values of the conditions. Box actions whose means are mixed need the
+    mixture; all others are drawn by drawing a program from W and running it, with a random choice at every branch.
 
     :param module: the program mixture, on the CPU; its parameters are read now: one sampler for each rollout
     :param state: of the conditions at the start: two tensors ``(1, n_envs, hidden_size)``
@@ -47,17 +48,18 @@ class ProgramSampler:
         if self.recurrent:
             rnn = conditions.rnn
             names = ("weight_ih_l0", "bias_ih_l0", "weight_hh_l0", "bias_hh_l0")
-            input_weight, input_bias, weight, self._bias = (_view(getattr(rnn, name)) for name in names)
+            _, input_bias, weight, self._bias = (_view(getattr(rnn, name)) for name in names)
+            input_weight = _view(conditions.input_weight)
             self._weight = np.ascontiguousarray(weight.T)
             self._readout, self._readout_bias = _view(conditions.readout), _view(conditions.readout_bias)
         elif self.needs_conditions:
-            input_weight, input_bias = _view(conditions.affine.weight), _view(conditions.affine.bias)
+            input_weight, input_bias = _view(conditions.input_weight), _view(conditions.affine.bias)
         else:
             input_weight, input_bias = np.zeros((0, module.n_inputs), np.float32), np.zeros(0, np.float32)
         self._n_gates = len(input_bias)
         controllers = (
             _view(parameter).reshape(module.n_controllers, self.action.n_outputs, -1)[self._in_use]
-            for parameter in (module.controllers.weight, module.controllers.bias)
+            for parameter in module.controller_parameters()
         )
         controller_weight, controller_bias = (block.reshape(-1, block.shape[-1]) for block in controllers)
         self._affine = np.ascontiguousarray(np.concatenate((input_weight, controller_weight)).T)
@@ -68,16 +70,19 @@ class ProgramSampler:
         #: Values of B at the steps made so far, ``(n_steps, n_envs, n_conditions)``; 0 where none is needed.
         self.condition_values = np.zeros((n_steps, n_envs, self.n_conditions), dtype=np.float32)
         self._n_controllers = module.n_controllers
+        self._thresholds: Array | None = None  # where no branch is drawn
         # Noise of all steps is drawn at once, which is several times cheaper than a little at every step.
         if self.action.kind == "box":
             self._noise = rng.standard_normal((n_steps, n_envs, self.action.n_outputs), dtype=np.float32)
+            if module.mixes_branches:
+                self._draw_branches((n_steps, 1, n_envs), rng)
         else:
             sizes = (1,) * self.action.n_outputs if self.action.kind == "multi_binary" else self.action.sizes
             self._edges = np.cumsum(sizes)[:-1]
             self._draw_programs((n_steps, len(sizes), n_envs), rng)
 
-    def _draw_programs(self, shape: tuple[int, int, int], rng: np.random.Generator) -> None:
-        """Draw a program for every action, how its branches will fall, and the noise of its controller's choice."""
+    def _draw_branches(self, shape: tuple[int, int, int], rng: np.random.Generator) -> None:
+        """Draw a program for every action, and how its branches will fall."""
         n_used = self.n_conditions if self._selected is None else self._selected
         self._last_controllers = np.full(shape, n_used)
         # B plus logistic noise is above 0 with the probability sigmoid(B).
@@ -87,6 +92,10 @@ class ProgramSampler:
             lengths = np.searchsorted(edges, rng.random(shape, dtype=np.float32), side="right")
             self._last_controllers += lengths
             self._thresholds[np.arange(n_used)[:, None, None, None] >= lengths] = np.inf  # not in this program
+
+    def _draw_programs(self, shape: tuple[int, int, int], rng: np.random.Generator) -> None:
+        """Draw a program for every action, how its branches will fall, and the noise of its controller's choice."""
+        self._draw_branches(shape, rng)
         # Logits plus logistic noise are above 0 as often as their sigmoid says; the largest of logits plus Gumbel noise
         # is a draw from their softmax.
         size = (shape[0], shape[2], self.action.n_outputs)
@@ -134,6 +143,8 @@ class ProgramSampler:
         if self.needs_conditions:
             self._run_conditions(affine[:, : self._n_gates], out=self.condition_values[step])
         outputs = affine[:, self._n_gates :].reshape(len(inputs), len(self._in_use), -1)
+        if self.action.kind == "box" and self._thresholds is not None:
+            return outputs[self._rows, self._controllers(step, 0)] + self._std * self._noise[step]
         if self.action.kind == "box":
             weights = self.mixture_weights(self.condition_values[step])
             return (weights[:, :, None] * outputs).sum(1) + self._std * self._noise[step]
@@ -147,6 +158,7 @@ class ProgramSampler:
 
     def _controllers(self, step: int, component: int) -> NDArray[np.int64]:
         """Run the programs drawn for one component of the action; return which controller decides, ``(n_envs,)``."""
+        assert self._thresholds is not None
         controllers = self._last_controllers[step, component]
         for k in reversed(range(len(self._thresholds))):
             np.copyto(controllers, k, where=self.condition_values[step, :, k] > self._thresholds[k, step, component])

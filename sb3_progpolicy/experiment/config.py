@@ -23,13 +23,22 @@ from sb3_progpolicy.reptile_ppo.environments import DEFAULT_N_ENVS
 REPTILE = ("tasks", "inner_updates", "tasks_per_iteration", "meta_learning_rate", "meta_optimizer", "meta_update")
 #: Largest seed, number of environments, and number of transitions in a rollout.
 MAX_SEED, MAX_ENVS, MAX_ROLLOUT = 2**32 - 1, 2**16, 2**28
-_SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "meta_learning_rate", "temperature", "action_std")
+_SCHEDULES = (
+    "learning_rate",
+    "clip_range",
+    "clip_range_vf",
+    "meta_learning_rate",
+    "temperature",
+    "action_std",
+    "action_temperature",
+)
 # Bounds, both included, of the numbers that have any; all are finite.
 _POSITIVE = (math.ulp(0.0), math.inf)
 _BOUNDS = {
     "learning_rate": (0.0, math.inf),
     "meta_learning_rate": (0.0, math.inf),
     "temperature": _POSITIVE,
+    "action_temperature": _POSITIVE,
     "action_std": _POSITIVE,
     "clip_range": _POSITIVE,
     "clip_range_vf": _POSITIVE,

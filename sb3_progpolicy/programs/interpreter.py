@@ -93,7 +93,8 @@ class ProgramRunner:
     :param program: what to run
     :param n_envs: number of rows of the inputs
     :param semantics: ``"crisp"`` runs a real if-then-else on ``B >= 0``; ``"soft"`` mixes the controllers with the
-        weights ``s_k * prod_{j<k}(1 - s_j)``, ``s = sigmoid(B / temperature)``, as in training
+        weights ``s_k * prod_{j<k}(1 - s_j)``, ``s = sigmoid(B / temperature)``, as in training;
+        for Box actions, if the program says ``"branches"``, it runs the controller with the largest weight
     :raises ValueError: if the program is not well formed or an argument is not accepted
 
     Conditions are numbered from the outermost inwards, and every one reads X at every step, reached or not: its
@@ -195,6 +196,8 @@ class ProgramRunner:
         if self.semantics == "crisp":
             taken = outputs[np.arange(self.n_envs), self.branch]
             threshold = 0.0
+        elif action.kind == "box" and self.program.semantics == "branches":
+            taken = outputs[np.arange(self.n_envs), self.mixture_weights.argmax(axis=1)]
         else:
             taken = np.einsum("nk,nko->no", self.mixture_weights, _distribution(action, outputs))
             threshold = 0.5

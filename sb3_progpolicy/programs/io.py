@@ -86,6 +86,7 @@ def _to_json(program: ProgramData) -> dict[str, Any]:
         "action": vars(program.action),
         "output_names": program.output_names,
         "temperature": program.temperature,
+        **({} if program.semantics == "means" else {"semantics": program.semantics}),
         "branches": [
             {"if": vars(condition), "then": vars(controller)}
             for condition, controller in zip(program.conditions, then, strict=True)
@@ -150,7 +151,8 @@ def _from_json(data: Any) -> ProgramData:
             "a newer file needs a newer sb3-progpolicy"
         )
     known = ("n_observations", "interaction", "input_names", "action", "output_names", "temperature")
-    _keys("file", data, ("format", "version", "metadata", *known, "branches", "else"))
+    optional = ("semantics",) if "semantics" in data else ()
+    _keys("file", data, ("format", "version", "metadata", *known, *optional, "branches", "else"))
     branches = _items("branches", data["branches"])
     if len(branches) > MAX_CONDITIONS:
         raise ValueError(f"branches: {len(branches)} conditions given; at most {MAX_CONDITIONS} are accepted")
@@ -170,6 +172,7 @@ def _from_json(data: Any) -> ProgramData:
         output_names=tuple(_items("output_names", data["output_names"])),
         temperature=_number("temperature", data["temperature"]),
         metadata=data["metadata"],
+        semantics=data.get("semantics", "means"),
     )
 
 

@@ -28,6 +28,8 @@ class Program(ProgramData):
     :param output_names: one readable name per controller output
     :param temperature: temperature of the sigmoid in the soft semantics, above 0
     :param metadata: where the program comes from (environment id, seed, steps ...); JSON values only
+    :param semantics: what the soft program does with Box actions: ``"means"`` mixes the controllers' outputs,
+        ``"branches"`` runs the likeliest controller
     """
 
     @property

@@ -11,6 +11,8 @@ from sb3_progpolicy.spaces import ActionSpec
 Vector = tuple[float, ...]
 Matrix = tuple[Vector, ...]
 Cell = Literal["affine", "rnn", "gru", "lstm"]
+BoxSemantics = Literal["means", "branches"]
+BOX_SEMANTICS: tuple[BoxSemantics, ...] = ("means", "branches")
 
 #: Gates stacked in the rows of a recurrent cell's weights, in PyTorch's order.
 GATES: dict[Cell, tuple[str, ...]] = {
@@ -87,6 +89,7 @@ class ProgramData:
     output_names: tuple[str, ...]
     temperature: float = 1.0
     metadata: Mapping[str, Any] = field(default_factory=dict)
+    semantics: BoxSemantics = "means"
 
     @property
     def n_inputs(self) -> int:

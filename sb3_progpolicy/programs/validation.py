@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
-from sb3_progpolicy.programs.syntax import GATES, Condition, Controller, IfThenElse, ProgramData
+from sb3_progpolicy.programs.syntax import BOX_SEMANTICS, GATES, Condition, Controller, IfThenElse, ProgramData
 from sb3_progpolicy.spaces import ActionKind, ActionSpec
 
 # Far above real use (a screen of Atari is 7 056 inputs), and small enough that every printer takes seconds.
@@ -31,6 +31,10 @@ def check_program(program: ProgramData) -> None:
     _check_names("output_names", program.output_names, program.action.n_outputs)
     if not _is_finite(program.temperature) or program.temperature <= 0:
         raise ValueError(f"temperature={_short(program.temperature)} is not accepted; it is a finite number above 0")
+    if program.semantics not in BOX_SEMANTICS:
+        raise ValueError(
+            f"semantics={_short(program.semantics)} is not accepted; it is one of {', '.join(BOX_SEMANTICS)}"
+        )
     expression, index = program.body, 0
     while isinstance(expression, IfThenElse):
         if index == MAX_CONDITIONS:

@@ -63,6 +63,9 @@ class Adapter:
     def set_temperature(self, temperature: float) -> None:
         """Set the temperature of the conditions; a network has none."""
 
+    def set_action_temperature(self, temperature: float) -> None:
+        """Set the temperature of discrete actions; a network has none."""
+
     def freeze(self, derivation: bool, phi: bool) -> None:
         """Freeze W, or everything else, or neither; a network has no W."""
 
@@ -122,6 +125,10 @@ class _ProgramAdapter(Adapter):
         """See :class:`Adapter`."""
         self.policy.set_temperature(temperature)
 
+    def set_action_temperature(self, temperature: float) -> None:
+        """See :class:`Adapter`."""
+        self.policy.set_action_temperature(temperature)
+
     def freeze(self, derivation: bool, phi: bool) -> None:
         """See :class:`Adapter`."""
         self.policy.optimizer.zero_grad()
@@ -158,7 +165,9 @@ class _ProgramAdapter(Adapter):
             logger.record(f"program/prob_{n_conditions}_conditions", probability)
         logger.record("program/search_entropy", module.search.entropy().item())
         logger.record("program/temperature", module.temperature.item())
+        logger.record("program/action_temperature", module.action_temperature.item())
         if isinstance(actor, SamplerActor):
+            logger.record("program/crisp_disagreement", actor.crisp_disagreement)
             names = [f"then_{k}" for k in range(1, module.depth)] + [f"last_{k}" for k in range(1, module.depth + 1)]
             for name, share in zip(names, actor.sampler.branch_frequencies(), strict=True):
                 logger.record(f"program/branch_{name}", share)

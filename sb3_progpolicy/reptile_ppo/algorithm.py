@@ -24,7 +24,7 @@ from sb3_progpolicy.reptile.checks import check_variations
 from sb3_progpolicy.reptile.statistics import EpisodeStatistics
 from sb3_progpolicy.reptile.steps import MetaOptimizer, MetaOptimizerName, Task, begin_task
 from sb3_progpolicy.reptile.tasks import TaskDistribution, default_tasks
-from sb3_progpolicy.reptile_ppo.environments import make_venv, with_history
+from sb3_progpolicy.reptile_ppo.environments import make_venv, symmetries_of, with_history
 from sb3_progpolicy.reptile_ppo.inner_loops import (
     EngineName,
     InnerLoops,
@@ -105,6 +105,10 @@ class ReptilePPO(StoredPPO):
     :param length_coef: price on the expected number of conditions, at least 0; the higher, the shorter the programs
     :param temperature: of the sigmoid in the soft semantics, a number or a schedule of the remaining progress; ``None``
         leaves it as the policy has it
+    :param action_temperature: what discrete actions' logits are divided by, a number or a schedule; 1 by default. An
+        action that is drawn need not be the likeliest one, which the crisp program takes: a schedule towards 0 makes
+        the two agree, as ``temperature`` does for conditions and ``action_std`` for Box actions
+    :param symmetric: tie the program's weights over the symmetries that the environment declares, such as Hanoi's pegs
     :param action_std: standard deviation of Box actions, a number or a schedule of the remaining progress; by default
         PPO learns it. Programs are read and run without noise, but what is learnt under much noise may rely on it: a
         schedule towards 0 makes the two agree
@@ -158,7 +162,9 @@ class ReptilePPO(StoredPPO):
         search_fraction: float = 0.5,
         length_coef: float = 0.005,
         temperature: float | Schedule | None = None,
+        action_temperature: float | Schedule | None = None,
         action_std: float | Schedule | None = None,
+        symmetric: bool = False,
         interaction_history: bool = True,
         normalize_observations: bool = False,
         scale_rewards: bool = False,
@@ -193,6 +199,9 @@ class ReptilePPO(StoredPPO):
         if learning_rate is None:
             learning_rate = 1e-2 if issubclass(policy_class, ProgrammaticActorCritic) else 3e-4
         policy_kwargs = dict(policy_kwargs or {})
+        self.symmetric = symmetric
+        if symmetric and "symmetries" not in policy_kwargs:
+            policy_kwargs["symmetries"] = symmetries_of(self.env_id, venv)
         if normalize_observations:
             policy_kwargs.setdefault("features_extractor_class", NormalizingExtractor)
         self.inner_updates, self.tasks_per_iteration = inner_updates, tasks_per_iteration
@@ -212,6 +221,7 @@ class ReptilePPO(StoredPPO):
             venv,
             length_coef=length_coef,
             temperature=temperature,
+            action_temperature=action_temperature,
             action_std=action_std,
             scale_rewards=scale_rewards,
             learning_rate=learning_rate,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -11,8 +11,11 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
 
+from progpolicy_envs import find_domain
+from progpolicy_envs.symmetry import Symmetry
 from sb3_progpolicy.interaction import InteractionHistory, VecInteractionHistory
 from sb3_progpolicy.reptile.tasks import RemakeOnVariation
+from sb3_progpolicy.symmetries import as_data
 from sb3_progpolicy.vec_env import make_fast_vec_env
 
 DEFAULT_N_ENVS = 32
@@ -55,3 +58,19 @@ def with_history(venv: VecEnv, interaction_history: bool) -> VecEnv:
     if interaction_history and not is_vecenv_wrapped(venv, VecInteractionHistory):
         return VecInteractionHistory(venv)
     return venv
+
+
+def symmetries_of(env_id: str | None, venv: VecEnv | None) -> list[dict[str, Any]]:
+    """Return the symmetries that an environment declares, as plain data.
+
+    :param env_id: id of the environment, where it is known
+    :param venv: the environments; asked for an attribute ``symmetries`` where the id is no domain's
+    :raises ValueError: if it declares none
+    """
+    domain = find_domain(env_id)
+    declared: Sequence[Symmetry] = () if domain is None else domain.symmetries
+    if not declared and venv is not None and venv.has_attr("symmetries"):
+        declared = venv.get_attr("symmetries")[0]
+    if not declared:
+        raise ValueError(f"symmetric=True is not accepted; {env_id or 'the environment'} declares no symmetries")
+    return [as_data(symmetry) for symmetry in declared]

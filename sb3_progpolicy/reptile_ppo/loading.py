@@ -30,8 +30,10 @@ if TYPE_CHECKING:
 #: What loading cannot change, because parameters or statistics depend on it.
 FIXED = (
     *("policy", "policy_kwargs", "meta_optimizer"),
-    *("interaction_history", "normalize_observations", "scale_rewards"),
+    *("interaction_history", "normalize_observations", "scale_rewards", "symmetric"),
 )
+#: Tensors of a policy that came later: files without them mean what a new policy has.
+_LATER = ("module.action_temperature",)
 MAX_ENVS, MAX_ROLLOUT, MAX_PARAMETERS = 2**16, 2**28, 10**7
 # What constructors raise for values of the right type that they cannot take.
 _REFUSALS = (TypeError, AttributeError, AssertionError, ArithmeticError, LookupError, RuntimeError, MemoryError)
@@ -213,8 +215,10 @@ def checked_parameters(model: ReptilePPO, saved: SavedModel) -> dict[str, Any]:
     :param saved: the file
     :raises ModelFormatError: if they do not fit, or are not finite
     """
-    policy = saved.under("policy")
-    _check_tensors("policy", policy, model.policy.state_dict())
+    policy, expected_policy = saved.under("policy"), model.policy.state_dict()
+    absent = {name: expected_policy[name].cpu().numpy() for name in _LATER if name in expected_policy}
+    policy = {**{name: array for name, array in absent.items() if name not in policy}, **policy}
+    _check_tensors("policy", policy, expected_policy)
     parameters: dict[str, Any] = {"policy": _to_torch(policy)}
     outer = META_OPTIMIZERS[model.meta_optimizer](model.policy.parameters(), lr=1.0)  # type: ignore[call-arg]
     for name, optimizer in zip(OPTIMIZERS, (model.policy.optimizer, outer), strict=True):
@@ -232,7 +236,7 @@ def checked_parameters(model: ReptilePPO, saved: SavedModel) -> dict[str, Any]:
             _check_tensors(f"{name}: parameter {number}", tensors, expected["state"][number])
         state = {number: _to_torch(tensors) for number, tensors in moments.items()}
         parameters[name] = {"state": state, "param_groups": groups}
-    known = len(policy) + sum(len(saved.under(name)) for name in (*OPTIMIZERS, "rollout"))
+    known = len(saved.under("policy")) + sum(len(saved.under(name)) for name in (*OPTIMIZERS, "rollout"))
     if known != len(saved.tensors):
         raise ModelFormatError(f"{len(saved.tensors) - known} unknown tensors")
     return parameters

@@ -87,6 +87,10 @@ def minibatches(
         yield from (order[start : start + per_batch] for start in range(0, n_sequences, per_batch))
 
 
+#: Of the steps of a rollout, each so many is looked at for how often soft and crisp disagree.
+DISAGREEMENT_STRIDE = 8
+
+
 class Actor(Protocol):
     """Chooses the actions of a rollout and keeps the recurrent states meanwhile."""
 
@@ -153,6 +157,8 @@ class SamplerActor:
         self.sampler = ProgramSampler(module, state, n_steps, rng, getattr(policy, "log_std", None))
         self.action_shape = (n_envs, *(policy.action_space.shape or ()))
         extractor = policy.features_extractor
+        #: Share of the rollout's steps on which the soft and the crisp program would not choose the same.
+        self.crisp_disagreement = 0.0
         self.normalizer = extractor if isinstance(extractor, NormalizingExtractor) else None
 
     @property
@@ -174,6 +180,8 @@ class SamplerActor:
         arrays = (buffer.observations, buffer.condition_values, buffer.actions)
         observations, condition_values, actions = (th.from_numpy(array).flatten(0, 1) for array in arrays)
         values, log_probs = self.policy.evaluate_condition_values(observations, condition_values, buffer.typed(actions))
+        rows = slice(None, None, DISAGREEMENT_STRIDE)
+        self.crisp_disagreement = self.policy.crisp_disagreement(observations[rows], condition_values[rows])
         buffer.values[:], buffer.log_probs[:] = (
             tensor.numpy().reshape(buffer.values.shape) for tensor in (values, log_probs)
         )

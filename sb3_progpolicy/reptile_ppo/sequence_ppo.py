@@ -40,6 +40,18 @@ def default_batch_size(n_steps: int, n_envs: int) -> int:
     return size if size >= n_steps else largest_divisor(n_steps, size)
 
 
+def positive(name: str, schedule: float | Schedule, progress: float) -> float:
+    """Return the value of a schedule.
+
+    :param progress: what remains of the training, from 1 to 0
+    :raises ValueError: if it is not above 0
+    """
+    value = float(FloatSchedule(schedule)(progress))
+    if not value > 0:
+        raise ValueError(f"{name}={value} is not accepted; it is above 0")
+    return value
+
+
 class SequencePPO(PPO):
     """PPO for networks and programs, with a state or without.
 
@@ -50,6 +62,7 @@ class SequencePPO(PPO):
     :param env: see ``PPO``
     :param length_coef: price on the expected number of conditions, at least 0
     :param temperature: of the conditions' sigmoid, a number or a schedule; ``None`` leaves it as the policy has it
+    :param action_temperature: of discrete actions' logits, a number or a schedule; ``None`` leaves it at 1
     :param action_std: standard deviation of Box actions, a number or a schedule; ``None`` lets PPO learn it
     :param scale_rewards: divide rewards by the running deviation of the return
     :param ppo: arguments of ``PPO``
@@ -66,6 +79,7 @@ class SequencePPO(PPO):
         *,
         length_coef: float,
         temperature: float | Schedule | None,
+        action_temperature: float | Schedule | None,
         action_std: float | Schedule | None,
         scale_rewards: bool,
         **ppo: Any,
@@ -73,6 +87,7 @@ class SequencePPO(PPO):
         if length_coef < 0:
             raise ValueError(f"length_coef={length_coef} is not accepted; it is at least 0")
         self.length_coef, self.temperature, self.action_std = length_coef, temperature, action_std
+        self.action_temperature = action_temperature
         self.reward_scaler = RewardScaler(ppo["gamma"]) if scale_rewards else None
         self.rng = np.random.default_rng()
         self._last_lstm_states: RNNStates | None = None
@@ -93,6 +108,8 @@ class SequencePPO(PPO):
                 f"{self.batch_size // self.sequence_length} sequences of {self.sequence_length} steps",
                 stacklevel=2,
             )
+        if self.action_temperature is not None and (self.search is None or hasattr(self.policy, "log_std")):
+            raise ValueError(f"action_temperature is for programs with discrete actions, not {self.action_space}")
         if self.action_std is not None and not hasattr(self.policy, "log_std"):
             raise ValueError(f"action_std is for Box actions, not {self.action_space}")
         self._last_lstm_states = self.adapter.initial_states(self.n_envs)
@@ -161,12 +178,11 @@ class SequencePPO(PPO):
         """Set the temperature and the deviation of the actions to where their schedules are."""
         progress = self._current_progress_remaining
         if self.temperature is not None:
-            self.adapter.set_temperature(FloatSchedule(self.temperature)(progress))
+            self.adapter.set_temperature(positive("temperature", self.temperature, progress))
+        if self.action_temperature is not None:
+            self.adapter.set_action_temperature(positive("action_temperature", self.action_temperature, progress))
         if self.action_std is not None:
-            deviation = FloatSchedule(self.action_std)(progress)
-            if not deviation > 0:
-                raise ValueError(f"action_std={deviation} is not accepted; it is above 0")
-            self.policy.log_std.fill_(math.log(deviation))
+            self.policy.log_std.fill_(math.log(positive("action_std", self.action_std, progress)))
 
     def _to_env(self, actions: NDArray[Any]) -> NDArray[Any]:
         """Return actions as the environment takes them."""

@@ -7,7 +7,8 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_progpolicy.differentiable.module import Conditions, ProgramModule
+from sb3_progpolicy.differentiable.conditions import Conditions
+from sb3_progpolicy.differentiable.module import ProgramModule
 from sb3_progpolicy.programs import ActionSpec, Program, ProgramRunner
 
 CELLS = ("affine", "rnn", "gru", "lstm")
