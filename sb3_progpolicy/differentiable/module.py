@@ -82,7 +82,7 @@ class ProgramModule(nn.Module):
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Load a state dict; one of release 0.1 has no action temperature, which was 1."""
         state_dict.setdefault(f"{prefix}action_temperature", th.ones_like(self.action_temperature))
-        super()._load_from_state_dict(state_dict, prefix, *args)  # type: ignore[no-untyped-call]
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     @property
     def n_controllers(self) -> int:
