@@ -21,7 +21,7 @@ def test_there_is_a_file_for_every_algorithm():
 
 def test_entry_of_an_environment_starts_from_the_default_one():
     hanoi, default = (load_hyperparams("reptile_ppo", env_id) for env_id in ("Hanoi-v0", "Other-v0"))
-    assert hanoi["batch_size"] == default["batch_size"]
+    assert hanoi["n_steps"] == default["n_steps"]
     assert hanoi["n_timesteps"] != default["n_timesteps"]
     assert load_hyperparams("reptile_ppo", "progpolicy_envs:Hanoi-v0") == hanoi
 

@@ -207,7 +207,7 @@ def test_set_env_takes_an_id():
 @pytest.mark.parametrize(
     "arguments",
     [
-        *({"scale_rewards": True}, {"normalize_observations": True}, {"interaction_history": False}),
+        *({"scale_rewards": True}, {"normalize_observations": False}, {"interaction_history": False}),
         *({"policy": "PRLPolicy"}, {"policy_kwargs": {"depth": 5}}, {"meta_optimizer": "sgd"}),
     ],
     ids=lambda arguments: next(iter(arguments)),

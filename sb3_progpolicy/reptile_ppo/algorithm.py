@@ -71,12 +71,12 @@ class ReptilePPO(StoredPPO):
 
     :param policy: ``"ProgPolicy"``, ``"PRLPolicy"``, ``"MlpPolicy"``, ``"MlpLstmPolicy"`` or a policy class
     :param env: an environment id (the fastest vectorised form is built), an environment or a ``VecEnv``
-    :param learning_rate: of the inner updates (Adam), a number or a schedule of the remaining progress; by default 0.01
+    :param learning_rate: of the inner updates (Adam), a number or a schedule of the remaining progress; by default 0.02
         for a program, which is nearly linear in its parameters and takes large steps, and 0.0003 for a network
     :param n_steps: steps of a rollout, per environment
     :param batch_size: transitions per gradient step; recurrent policies take ``batch_size / n_steps`` whole sequences,
         or, where ``batch_size`` is smaller, sequences of ``batch_size`` steps, or, with a warning, of the next smaller
-        divisor of ``n_steps``. By default an eighth of the rollout, or the next smaller divisor of ``n_steps``
+        divisor of ``n_steps``. By default the rollout, up to 2048, for a program, and an eighth of it for a network
     :param n_epochs: passes over a rollout
     :param gamma: discount factor
     :param gae_lambda: of generalised advantage estimation
@@ -113,7 +113,8 @@ class ReptilePPO(StoredPPO):
         PPO learns it. Programs are read and run without noise, but what is learnt under much noise may rely on it: a
         schedule towards 0 makes the two agree
     :param interaction_history: append previous action, reward and done to the observation
-    :param normalize_observations: shift and scale observations by running statistics (folded into the program)
+    :param normalize_observations: shift and scale observations by running statistics, which are folded into the program
+        that is extracted; by default for a program, and not for a network
     :param scale_rewards: divide rewards by the running deviation of the return
     :param stats_window_size: episodes averaged in the logs
     :param tensorboard_log: folder of the TensorBoard logs
@@ -136,7 +137,7 @@ class ReptilePPO(StoredPPO):
         policy: str | type[ActorCriticPolicy],
         env: GymEnv | str | None,
         learning_rate: float | Schedule | None = None,
-        n_steps: int = 128,
+        n_steps: int = 32,
         batch_size: int | None = None,
         n_epochs: int = 10,
         gamma: float = 0.99,
@@ -166,7 +167,7 @@ class ReptilePPO(StoredPPO):
         action_std: float | Schedule | None = None,
         symmetric: bool = False,
         interaction_history: bool = True,
-        normalize_observations: bool = False,
+        normalize_observations: bool | None = None,
         scale_rewards: bool = False,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -193,11 +194,14 @@ class ReptilePPO(StoredPPO):
         if env is not None:
             remade = self.tasks.apply == "constructor"
             venv = with_history(make_venv(env, n_envs, seed, env_kwargs or {}, remade), interaction_history)
-        if batch_size is None:
-            batch_size = default_batch_size(n_steps, 1 if venv is None else venv.num_envs)
         policy_class = self._get_policy_from_name(policy) if isinstance(policy, str) else policy
+        learns_program = issubclass(policy_class, ProgrammaticActorCritic)
+        if batch_size is None:
+            batch_size = default_batch_size(n_steps, 1 if venv is None else venv.num_envs, learns_program)
         if learning_rate is None:
-            learning_rate = 1e-2 if issubclass(policy_class, ProgrammaticActorCritic) else 3e-4
+            learning_rate = 2e-2 if learns_program else 3e-4
+        if normalize_observations is None:
+            normalize_observations = learns_program
         policy_kwargs = dict(policy_kwargs or {})
         self.symmetric = symmetric
         if symmetric and "symmetries" not in policy_kwargs:

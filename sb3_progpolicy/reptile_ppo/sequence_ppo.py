@@ -28,15 +28,22 @@ from sb3_progpolicy.reptile_ppo.adapters import adapt
 from sb3_progpolicy.reptile_ppo.rollout import Actor, Batch, SequenceBuffer, minibatches
 from sb3_progpolicy.spaces import action_spec
 
+MAX_DEFAULT_BATCH = 2048
+
 
 def largest_divisor(number: int, limit: int) -> int:
     """Return the largest divisor of a number up to a limit."""
     return next(divisor for divisor in range(min(number, limit), 0, -1) if number % divisor == 0)
 
 
-def default_batch_size(n_steps: int, n_envs: int) -> int:
-    """Return an eighth of a rollout; where that is less than a sequence, the next smaller divisor of its length."""
-    size = max(2, n_steps * n_envs // 8)
+def default_batch_size(n_steps: int, n_envs: int, learns_program: bool) -> int:
+    """Return the whole rollout, up to 2048 transitions, for a program, and an eighth of it for a network.
+
+    An update of a small program costs torch's calls, not arithmetic: few large steps are as good as many small ones and
+    quicker. Where the size is less than a sequence it is the next smaller divisor of a sequence's length.
+    """
+    rollout = n_steps * n_envs
+    size = largest_divisor(rollout, MAX_DEFAULT_BATCH) if learns_program else max(2, rollout // 8)
     return size if size >= n_steps else largest_divisor(n_steps, size)
 
 
