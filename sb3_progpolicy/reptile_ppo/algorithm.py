@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
@@ -18,13 +19,14 @@ from sb3_progpolicy.extraction import env_id_of, extract_program, wrappers_of
 from sb3_progpolicy.interaction import program_names
 from sb3_progpolicy.normalization import NormalizingExtractor
 from sb3_progpolicy.policies import ProgrammaticActorCritic, ProgrammaticPolicy, RecurrentProgrammaticPolicy
-from sb3_progpolicy.programs.program import Program
+from sb3_progpolicy.programs.program import LEARNED_BY, Program
 from sb3_progpolicy.reptile.callback import check_reptile_arguments, start_task
 from sb3_progpolicy.reptile.checks import check_variations
 from sb3_progpolicy.reptile.statistics import EpisodeStatistics
 from sb3_progpolicy.reptile.steps import MetaOptimizer, MetaOptimizerName, Task, begin_task
 from sb3_progpolicy.reptile.tasks import TaskDistribution, default_tasks
 from sb3_progpolicy.reptile_ppo.environments import make_venv, with_history
+from sb3_progpolicy.reptile_ppo.initial import initial_policy_kwargs, read_initial_program, start_from_program
 from sb3_progpolicy.reptile_ppo.inner_loops import (
     EngineName,
     InnerLoops,
@@ -102,6 +104,9 @@ class ReptilePPO(StoredPPO):
         environment id
     :param meta_update: ``False`` for PPO-N: tasks change, the meta-step is left out
     :param search_fraction: share of the steps, 0 to 1, after which the program is extracted
+    :param init_program: start from this program, without a search: a ``Program``, its ``.json`` file, a run folder or
+        the name of a shipped one. Soft and crisp program are equal then but close to where a condition changes, and Box
+        actions have a deviation of a tenth of half their range, unless ``temperature`` and ``action_std`` say otherwise
     :param length_coef: price on the expected number of conditions, at least 0; the higher, the shorter the programs
     :param temperature: of the sigmoid in the soft semantics, a number or a schedule of the remaining progress; ``None``
         leaves it as the policy has it
@@ -156,6 +161,7 @@ class ReptilePPO(StoredPPO):
         engine: EngineName = "local",
         meta_update: bool = True,
         search_fraction: float = 0.5,
+        init_program: Program | str | os.PathLike[str] | None = None,
         length_coef: float = 0.005,
         temperature: float | Schedule | None = None,
         action_std: float | Schedule | None = None,
@@ -190,6 +196,10 @@ class ReptilePPO(StoredPPO):
         policy_kwargs = dict(policy_kwargs or {})
         if normalize_observations:
             policy_kwargs.setdefault("features_extractor_class", NormalizingExtractor)
+        initial = read_initial_program(init_program)
+        if initial is not None:
+            policy_kwargs = initial_policy_kwargs(initial, policy_class, policy_kwargs)
+        self._initial_program, self.learned_by = initial, LEARNED_BY[0]
         if tasks is None:
             tasks = default_tasks(self.env_id)
         self.tasks = tasks if isinstance(tasks, TaskDistribution) else TaskDistribution(tasks)
@@ -236,6 +246,9 @@ class ReptilePPO(StoredPPO):
 
     def _setup_model(self) -> None:
         super()._setup_model()  # lines 1-2: the derivation graph, its W at even odds, and phi
+        if self._initial_program is not None:
+            self.learned_by = start_from_program(self, self._initial_program)
+            self._initial_program = None
         self._statistics: EpisodeStatistics | None = None
         self.outer_optimizer = MetaOptimizer(self.meta_optimizer)
 
