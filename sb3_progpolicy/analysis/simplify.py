@@ -95,6 +95,7 @@ def simplify(
     success_tolerance: float = 0.01,
     steps_tolerance: float = 0.05,
     n_terms: int | None = None,
+    finetune: int | None = None,
     seed: int = 0,
 ) -> Simplification:
     """Return the program with the fewest whole numbers that makes the same decisions on training variations.
@@ -107,7 +108,8 @@ def simplify(
     With Box actions no numbers do exactly the same. There terms are added one by one, those first that bring the
     actions nearest to the original's, fitted by least squares on the states that the original meets and rounded, until
     success and steps on the training variations are within a tolerance; then those are left out again without which
-    they still are. Branches that never act are dropped.
+    they still are. Branches that never act are dropped. If asked, PPO then trains the numbers of the controllers that
+    are left; what comes of it is taken if success and steps on the training variations are better.
 
     :param program: acts in a Discrete space or a Box
     :param env_id: id of a planning domain; by default the one in the program's metadata
@@ -122,6 +124,7 @@ def simplify(
     :param success_tolerance: with Box actions, by how much the share of successes may fall
     :param steps_tolerance: with Box actions, by what share the steps may rise
     :param n_terms: with Box actions, take the program of so many terms, good enough or not
+    :param finetune: with Box actions, environment steps of that training; ``None`` for none
     :param seed: of the drawn starts
     :raises ValueError: if an argument is not accepted
     """
@@ -131,6 +134,8 @@ def simplify(
         raise ValueError("the program does not say which environment it is for; give env_id")
     if equally_good not in ("program", "planner"):
         raise unknown("equally_good", equally_good, ("program", "planner"))
+    if finetune is not None and finetune < 1:
+        raise ValueError(f"finetune={finetune} is not accepted; it is at least 1")
     if program.action.kind not in ("discrete", "box"):
         raise ValueError(f"{program.action.kind} actions are not accepted here; Discrete and Box ones are")
     refuse_wrappers("the program", program.metadata.get("wrappers", ()))
@@ -149,11 +154,14 @@ def simplify(
             success_tolerance=success_tolerance,
             steps_tolerance=steps_tolerance,
             n_terms=n_terms,
+            finetune_for=finetune,
             seed=seed,
         )
         return _of_pruned(program, pruned, domain, began)
     if n_terms is not None:
         raise ValueError(f"n_terms={n_terms} is not accepted for Discrete actions; the fewest are found")
+    if finetune is not None:
+        raise ValueError(f"finetune={finetune} is not accepted for Discrete actions; their decisions stay the same")
     planner = equally_good == "planner"
     situations = meet(program, env_id, variations, n_starts, planner, seed)
     if not len(situations.inputs):
@@ -209,6 +217,9 @@ def _of_pruned(program: ProgramData, pruned: Pruned, domain: Domain, began: floa
     metadata = dict(program.metadata)
     if small.body != program.body:
         metadata["simplified"] = {"from": program_digest(program), "terms": terms, "symmetry": symmetry}
+    if pruned.finetuned:
+        metadata["simplified"]["finetuned"] = pruned.finetuned
+        metadata["learned_by"] = pruned.learned_by
     return Simplification(
         program=Program(**{**vars(small), "metadata": metadata}),
         terms_before=count_numbers(program),
