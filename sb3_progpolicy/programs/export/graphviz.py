@@ -54,7 +54,7 @@ def export_graphviz(
 class _DotPrinter(ProgramVisitor[list[str]]):
     def __init__(self, program: ProgramData, decimals: int, max_terms: MaxTerms) -> None:
         super().__init__(program)
-        self.number = Decimals(program, decimals)
+        self.number = Decimals(decimals)
         self.max_terms, self.blocks = terms_to_show(program, max_terms), blocks_of(program)
 
     def visit_branch(self, branch: IfThenElse, index: int) -> list[str]:

@@ -62,7 +62,7 @@ def export_latex(
 class _LatexPrinter(ProgramVisitor[list[str]]):
     def __init__(self, program: ProgramData, decimals: int) -> None:
         super().__init__(program)
-        self.number = Decimals(program, decimals)
+        self.number = Decimals(decimals)
 
     def print(self) -> str:
         program = self.program

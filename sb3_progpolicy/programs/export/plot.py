@@ -121,7 +121,7 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
 
     def __init__(self, program: ProgramData, decimals: int, max_terms: MaxTerms, max_outputs: int) -> None:
         super().__init__(program)
-        self.number, self.max_outputs = Decimals(program, decimals), max_outputs
+        self.number, self.max_outputs = Decimals(decimals), max_outputs
         self.max_terms, self.blocks = terms_to_show(program, max_terms), blocks_of(program)
 
     def visit_branch(self, branch: IfThenElse, index: int) -> list[tuple[_Card | None, _Card]]:

@@ -33,8 +33,8 @@ def export_text(program: ProgramData, decimals: int = 2, max_terms: int | None =
     """Print a program as an indented if-then-else that a person can read.
 
     The terms of every sum stand in order of size. Those that round to zero or come after ``max_terms`` are only
-    counted. If all weights and constants are whole, they are printed without a point. :func:`export_python` and the
-    saved file hold all numbers in full.
+    counted. Whole numbers are printed without a point, so that ``3`` is exact and ``3.00`` is rounded.
+    :func:`export_python` and the saved file hold all numbers in full.
 
     :param program: what to print
     :param decimals: digits after the point
@@ -48,7 +48,7 @@ def export_text(program: ProgramData, decimals: int = 2, max_terms: int | None =
 class _TextPrinter(ProgramVisitor[list[str]]):
     def __init__(self, program: ProgramData, decimals: int, max_terms: int | None) -> None:
         super().__init__(program)
-        self.number, self.max_terms = Decimals(program, decimals), max_terms
+        self.number, self.max_terms = Decimals(decimals), max_terms
         self.blocks = blocks_of(program)
         self.inputs = [_set_apart(n) if _OPERATORS & set(n) or n[0].isdigit() else n for n in program.input_names]
 

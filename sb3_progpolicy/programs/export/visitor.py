@@ -73,39 +73,25 @@ def is_whole(value: float) -> bool:
     return math.isfinite(value) and abs(value) < 1e9 and value == int(value)
 
 
-def has_whole_numbers(program: ProgramData) -> bool:
-    """Whether all weights and constants of a program are whole, as those of one written by hand often are."""
-    return all(
-        is_whole(value)
-        for rows in (
-            *((*condition.weight_ih, *condition.weight_hh) for condition in program.conditions),
-            *((condition.bias_ih, condition.bias_hh, condition.readout) for condition in program.conditions),
-            *((*controller.weights, controller.bias) for controller in program.controllers),
-            [[condition.readout_bias for condition in program.conditions]],
-        )
-        for row in rows
-        for value in row
-    )
-
-
 class Decimals:
-    """Numbers as people read them: rounded, or without a point where all of the program's are whole.
+    """Numbers as people read them: whole ones without a point, all others rounded.
 
-    :param program: whose numbers are printed
-    :param decimals: digits after the point
+    :param digits: after the point
     """
 
-    def __init__(self, program: ProgramData, decimals: int) -> None:
-        self.digits = 0 if has_whole_numbers(program) else decimals
+    def __init__(self, digits: int) -> None:
+        self.digits = digits
 
     def __call__(self, value: float) -> str:
         """Print a number; one that is not zero but rounds to it is 0.00, and zero itself is 0."""
+        if is_whole(value):
+            return str(int(value))
         shown = round(value, self.digits) or 0.0  # no "-0.00"
-        return f"{shown:.{self.digits}f}" if value else "0"
+        return f"{shown:.{self.digits}f}"
 
     def factor(self, weight: float, between: str) -> str:
         """Print the size of a weight before a name, nothing for the whole number 1."""
-        return "" if self.digits == 0 and abs(weight) == 1 else f"{self(abs(weight))}{between}"
+        return "" if abs(weight) == 1 else f"{self(abs(weight))}{between}"
 
 
 def _by_size(term: tuple[float, str]) -> float:
