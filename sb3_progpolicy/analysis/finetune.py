@@ -108,10 +108,10 @@ def finetune(
     gradients.critic_alone_until = CRITIC_FIRST * n_timesteps
     assert model.env is not None
     with contextlib.closing(model.env):
-        model.learn(n_timesteps)
+        learned = model.learn(n_timesteps).program()
     trained = [
         np.where(mask, symmetric_part(program, matrix_of(controller), symmetries), 0.0)
-        for controller, mask in zip(model.program().controllers, gradients.mask, strict=True)
+        for controller, mask in zip(learned.controllers, gradients.mask, strict=True)
     ]
     return with_controllers(program, trained), model.learned_by
 

@@ -1,7 +1,7 @@
 // The program as a tree: conditions from top to bottom along a spine, and the controller that each leads to.
 
 const FEW_TERMS = 4;
-const CELLS = { rnn: "RNN", gru: "GRU", lstm: "LSTM" };
+const CELLS = { rnn: "RNN", gru: "GRU", lstm: "LSTM", switch: "switch" };
 
 // A sum as text, the largest terms first; what is zero is left out, and what comes after `most` only counted.
 function formula(constant, weights, names, most) {
@@ -34,7 +34,9 @@ class ProgramView {
     );
     const look = conditions.length ? "spine" : "spine alone";
     const spine = make("ol", { class: look, "aria-label": "Program" }, this.branches);
-    const hides = [...controllers.flatMap(({ weights }) => weights), ...conditions.map(({ readout }) => readout)].some(
+    const sums = [...controllers.flatMap(({ weights }) => weights), ...conditions.map(({ readout }) => readout)];
+    const switches = conditions.filter(({ cell }) => cell === "switch").flatMap(({ weightIh }) => weightIh);
+    const hides = [...sums, ...switches].some(
       (row) => row.filter((weight) => weight !== 0).length > FEW_TERMS
     );
     const toggle = () => {
@@ -68,8 +70,20 @@ class ProgramView {
     return formula(readoutBias, readout, cell === "affine" ? this.program.inputNames : units, this.most());
   }
 
+  // A switch alone: what turns it on and off. It is off at first.
+  switches({ weightIh, biasIh, biasHh }) {
+    const lines = ["on", "off"].map((name, i) => {
+      const sum = formula(biasIh[i] + biasHh[i], weightIh[i], this.program.inputNames, this.most());
+      return make("p", { class: "sum" }, `${name} when `, sum, "\u2265 0");
+    });
+    return make("div", {}, lines);
+  }
+
   listens({ cell, readout }, index) {
     if (cell === "affine") return null;
+    const condition = this.program.conditions[index];
+    const reads = cell === "switch" && condition.weightHh.some((row) => row.some((weight) => weight !== 0));
+    if (cell === "switch" && readout.length === 1 && !reads) return this.switches(condition);
     const sizes = this.importance[index].map((size, i) => [size, this.program.inputNames[i]]);
     const order = sizes.filter(([size]) => size > 0);
     const names = order.sort((a, b) => b[0] - a[0]).slice(0, 3).map(([, name]) => pretty(name));

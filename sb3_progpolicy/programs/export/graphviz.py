@@ -14,7 +14,9 @@ from sb3_progpolicy.programs.export.visitor import (
     counted,
     deliver,
     input_importance,
+    is_switch,
     largest_terms,
+    switch_sums,
     title,
 )
 from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, ProgramData
@@ -69,7 +71,7 @@ class _DotPrinter(ProgramVisitor[list[str]]):
 
     def visit_controller(self, controller: Controller, index: int) -> list[str]:
         lines = [
-            f"{name} = {self._sum(constant, *collapse(self.blocks, weights, self.program.input_names))}"
+            f"{name} = {self._inputs_sum(constant, weights)}"
             for name, constant, weights in zip(
                 self.program.output_names, controller.bias, controller.weights, strict=True
             )
@@ -81,7 +83,14 @@ class _DotPrinter(ProgramVisitor[list[str]]):
         if condition.cell == "affine":
             return [
                 f"B{index + 1} >= 0 ?",
-                self._sum(condition.readout_bias, *collapse(self.blocks, condition.readout, self.program.input_names)),
+                self._inputs_sum(condition.readout_bias, condition.readout),
+            ]
+        if is_switch(condition):
+            while_on, while_off = condition.readout_bias + condition.readout[0], condition.readout_bias
+            return [
+                f"B{index + 1} >= 0 ?",
+                f"B{index + 1} = {self.number(while_on)} while on, {self.number(while_off)} while off",
+                *(f"{name} when  {self._inputs_sum(*of_x)}  >= 0" for name, of_x in switch_sums(condition)),
             ]
         units = [f"h{unit + 1}" for unit in range(condition.hidden_size)]
         heard = largest_terms(input_importance(condition), self.program.input_names, 9, self.max_terms)
@@ -91,6 +100,9 @@ class _DotPrinter(ProgramVisitor[list[str]]):
             f"memory: {counted(condition.hidden_size, f'{CELL_NAMES[condition.cell]} unit')}",
             f"listens most to {', '.join(name for _, name in heard.shown) or 'nothing'}",
         ]
+
+    def _inputs_sum(self, constant: float, weights: Sequence[float]) -> str:
+        return self._sum(constant, *collapse(self.blocks, weights, self.program.input_names))
 
     def _sum(self, constant: float, weights: Sequence[float], names: Sequence[str]) -> str:
         terms = largest_terms(weights, names, self.number.digits, self.max_terms)

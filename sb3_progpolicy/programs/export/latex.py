@@ -32,6 +32,11 @@ _CELLS = {
         r"n &= \tanh(W_n x + b_n + r \odot (U_n h_{%d} + d_n))",
         r"h_{%d} &\leftarrow (1 - z) \odot n + z \odot h_{%d}",
     ),
+    "switch": (
+        r"(p, q) &= W x + b + U h_{%d} + d",
+        r"h_{%d} &\leftarrow \begin{cases} 1 & \text{if } p \ge 0 \\ 0 & \text{else if } q \ge 0 \\"
+        r" h_{%d} & \text{otherwise} \end{cases}",
+    ),
     "lstm": (
         r"(i, f, o) &= \sigma(W_{i,f,o} x + b_{i,f,o} + U_{i,f,o} h_{%d} + d_{i,f,o})",
         r"g &= \tanh(W_g x + b_g + U_g h_{%d} + d_g)",

@@ -13,7 +13,9 @@ from sb3_progpolicy.programs.export.visitor import (
     ProgramVisitor,
     counted,
     input_importance,
+    is_switch,
     largest_terms,
+    switch_sums,
     title,
 )
 from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, ProgramData
@@ -133,6 +135,8 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
 
     def _condition(self, condition: Condition, index: int) -> _Card:
         inputs = self.program.input_names
+        if is_switch(condition):
+            return self._switch(condition, index)
         if condition.cell == "affine":
             readout, names = collapse(self.blocks, condition.readout, inputs)
             constant, terms = self._terms(condition.readout_bias, readout, names)
@@ -143,12 +147,17 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
             heard = largest_terms(input_importance(condition), inputs, 9, self.max_terms)
             lines = [f"memory h: {counted(condition.hidden_size, f'{CELL_NAMES[condition.cell]} unit')}"]
             lines += ["listens most to", *(f"  {_label(name)}" for _, name in heard.shown)] if heard.shown else []
-        number = index + 1
-        formula = [(f"B{number} = {constant}", INK, 0)]
-        for text, colour in terms:
-            formula.append((text, colour, formula[-1][2] + len(formula[-1][0]) + 1))
-        head = ((f"{'if' if not index else 'else if'} B{number} ≥ 0", INK, 0),)
-        return _Card((head, tuple(formula), *(((line, QUIET, 0),) for line in lines)))
+        formula = _in_a_row(f"B{index + 1} = {constant}", terms)
+        return _Card((_head(index), formula, *(((line, QUIET, 0),) for line in lines)))
+
+    def _switch(self, condition: Condition, index: int) -> _Card:
+        while_on, while_off = condition.readout_bias + condition.readout[0], condition.readout_bias
+        values = f"B{index + 1} = {self.number(while_on)} while on, {self.number(while_off)} while off"
+        rows = []
+        for name, (constant, weights) in switch_sums(condition):
+            shown, terms = self._terms(constant, *collapse(self.blocks, weights, self.program.input_names))
+            rows.append(_in_a_row(f"{name + ' when':<8} {shown}", [*terms, ("≥ 0", INK)]))
+        return _Card((_head(index), ((values.replace("-", MINUS), QUIET, 0),), *rows))
 
     def _leaf(self, controller: Controller) -> _Card:
         names = [_label(name) for name in self.program.output_names]
@@ -183,6 +192,18 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
         ]
         left_out = [(f"… {terms.n_dropped}", QUIET)] if terms.n_dropped else []
         return self.number(constant).replace("-", MINUS), [*shown, *left_out]
+
+
+def _head(index: int) -> tuple[tuple[str, str, int], ...]:
+    return ((f"{'if' if not index else 'else if'} B{index + 1} ≥ 0", INK, 0),)
+
+
+def _in_a_row(start: str, terms: Sequence[tuple[str, str]]) -> tuple[tuple[str, str, int], ...]:
+    """A row of a card: texts one after the other."""
+    row = [(start, INK, 0)]
+    for text, colour in terms:
+        row.append((text, colour, row[-1][2] + len(row[-1][0]) + 1))
+    return tuple(row)
 
 
 def _label(name: str) -> str:

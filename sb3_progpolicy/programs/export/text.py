@@ -12,9 +12,11 @@ from sb3_progpolicy.programs.export.visitor import (
     action_rule,
     counted,
     gate_names,
+    is_switch,
     largest_terms,
     pack,
     simplified_as,
+    switch_sums,
     title,
 )
 from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, ProgramData
@@ -26,6 +28,7 @@ _RULES = {
     "rnn": "RNN:  each step, h becomes the value of its line.",
     "gru": "GRU:  each step, h becomes (1 - z)*n + z*h, so z near 1 keeps the memory and z near 0 writes n.",
     "lstm": "LSTM: each step, c becomes f*c + i*g and h becomes o*tanh(c), so f keeps, i writes and o shows.",
+    "switch": "Switch: a step turns it on where its first line holds, off where only the second does; else it stays.",
 }
 
 
@@ -103,7 +106,7 @@ class _TextPrinter(ProgramVisitor[list[str]]):
             lines += self._inputs_sum(start, constant, weights)
         return lines
 
-    def _inputs_sum(self, start: str, constant: float, weights: Sequence[float]) -> list[str]:
+    def _inputs_sum(self, start: str, constant: float, weights: Sequence[float], close: str = "") -> list[str]:
         """A sum over X, its grids as functions of row and column where they are such."""
         left, functions = list(weights), []
         for block in self.blocks:
@@ -111,13 +114,19 @@ class _TextPrinter(ProgramVisitor[list[str]]):
             if function is not None and any(function):
                 functions.append(function_text(block, function))
                 left[block.start : block.stop] = [0.0] * (block.stop - block.start)
-        return self._sum(start, constant, left, self.inputs, functions=functions)
+        return self._sum(start, constant, left, self.inputs, close, functions)
 
     def _condition(self, condition: Condition, index: int) -> list[str]:
         size = condition.hidden_size
         start = f"B{index + 1} = "
         if condition.cell == "affine":
             return self._inputs_sum(start, condition.readout_bias, condition.readout)
+        if is_switch(condition):
+            while_on, while_off = condition.readout_bias + condition.readout[0], condition.readout_bias
+            lines = [f"{start}{self.number(while_on)} while on, {self.number(while_off)} while off"]
+            for name, (constant, weights) in switch_sums(condition):
+                lines += self._inputs_sum(f"{INDENT}{name + ' when':<9}", constant, weights, " >= 0")
+            return lines
         units = [f"h{unit + 1}" for unit in range(size)]
         lines = self._sum(start, condition.readout_bias, condition.readout, units)
         lines.append(f"{INDENT}its memory: {counted(size, f'{CELL_NAMES[condition.cell]} unit')}")
@@ -129,9 +138,13 @@ class _TextPrinter(ProgramVisitor[list[str]]):
     def _gates(self, condition: Condition, units: Sequence[str]) -> list[list[str]]:
         gates, names = [], [*self.inputs, *units]
         for row, (gate, unit) in enumerate(gate_names(condition)):
-            squash = "tanh" if gate in ("h", "n", "g") else "sigmoid"
+            squash = {"on": "", "off": ""}.get(gate, "tanh" if gate in ("h", "n", "g") else "sigmoid")
             recurrent, constant = condition.weight_hh[row], condition.bias_ih[row] + condition.bias_hh[row]
             label = f"{INDENT}h{unit + 1} = " if gate == "h" else f"{INDENT}{gate}{unit + 1} = "
+            if not squash:
+                label = f"{INDENT}h{unit + 1} {gate} when "
+                gates.append(self._sum(label, constant, (*condition.weight_ih[row], *recurrent), names, " >= 0"))
+                continue
             if gate != "n":
                 gates.append(
                     self._sum(f"{label}{squash}(", constant, (*condition.weight_ih[row], *recurrent), names, ")")

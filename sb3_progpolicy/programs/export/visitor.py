@@ -16,7 +16,7 @@ from sb3_progpolicy.spaces import ActionSpec
 
 Result = TypeVar("Result")
 
-CELL_NAMES = {"affine": "affine", "rnn": "RNN", "gru": "GRU", "lstm": "LSTM"}
+CELL_NAMES = {"affine": "affine", "rnn": "RNN", "gru": "GRU", "lstm": "LSTM", "switch": "switch"}
 
 
 class ProgramVisitor(ABC, Generic[Result]):
@@ -109,6 +109,17 @@ def input_importance(condition: Condition) -> tuple[float, ...]:
         sum(abs(weight * condition.readout[row % size]) for row, weight in enumerate(column))
         for column in zip(*condition.weight_ih, strict=True)
     )
+
+
+def is_switch(condition: Condition) -> bool:
+    """Whether a condition is one switch that does not read itself, which is printed as what turns it on and off."""
+    return condition.cell == "switch" and condition.hidden_size == 1 and not any(map(any, condition.weight_hh))
+
+
+def switch_sums(condition: Condition) -> list[tuple[str, tuple[float, Sequence[float]]]]:
+    """What turns a switch on and off: ``"on"`` or ``"off"``, the constant and the weights of X of either sum."""
+    constants = [one + other for one, other in zip(condition.bias_ih, condition.bias_hh, strict=True)]
+    return list(zip(GATES["switch"], zip(constants, condition.weight_ih, strict=True), strict=True))
 
 
 def gate_names(condition: Condition) -> list[tuple[str, int]]:
