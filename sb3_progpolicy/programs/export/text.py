@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sb3_progpolicy.programs.export.grids import LEGEND, as_function, blocks_of, function_text
+from sb3_progpolicy.programs.export.grids import LEGEND, Tables, block_text, blocks_of
 from sb3_progpolicy.programs.export.visitor import (
     CELL_NAMES,
     Decimals,
@@ -52,7 +52,7 @@ class _TextPrinter(ProgramVisitor[list[str]]):
     def __init__(self, program: ProgramData, decimals: int, max_terms: int | None) -> None:
         super().__init__(program)
         self.number, self.max_terms = Decimals(decimals), max_terms
-        self.blocks = blocks_of(program)
+        self.blocks, self.tables = blocks_of(program), Tables()
         self.inputs = [_set_apart(n) if _OPERATORS & set(n) or n[0].isdigit() else n for n in program.input_names]
 
     def print(self) -> str:
@@ -95,7 +95,9 @@ class _TextPrinter(ProgramVisitor[list[str]]):
 
     def _legend(self, printed: str) -> list[str]:
         used = [block.name for block in self.blocks if f"{block.name}*(" in printed]
-        return ["", *(LEGEND.format(name=name) for name in used)] if used else []
+        legend = ["", *(LEGEND.format(name=name) for name in used)] if used else []
+        tables = self.tables.new_lines()
+        return [*legend, *([""] if tables else []), *tables]
 
     def _lines(self, controller: Controller) -> list[str]:
         names = [_set_apart(name) if "=" in name else name for name in self.program.output_names]
@@ -107,12 +109,12 @@ class _TextPrinter(ProgramVisitor[list[str]]):
         return lines
 
     def _inputs_sum(self, start: str, constant: float, weights: Sequence[float], close: str = "") -> list[str]:
-        """A sum over X, its grids as functions of row and column where they are such."""
+        """A sum over X, its grids as functions of row and column or as tables where they are such."""
         left, functions = list(weights), []
         for block in self.blocks:
-            function = as_function(block, weights)
-            if function is not None and any(function):
-                functions.append(function_text(block, function))
+            text = block_text(block, weights, self.tables)
+            if text is not None:
+                functions.append(text)
                 left[block.start : block.stop] = [0.0] * (block.stop - block.start)
         return self._sum(start, constant, left, self.inputs, close, functions)
 

@@ -57,14 +57,19 @@ class Terms:
     n_dropped: int
 
 
-def largest_terms(weights: Sequence[float], names: Sequence[str], decimals: int, max_terms: int | None) -> Terms:
+def largest_terms(
+    weights: Sequence[float], names: Sequence[str], decimals: int, max_terms: int | None, first: tuple[str, ...] = ()
+) -> Terms:
     """Sort the terms of ``weights · names`` by size and drop those that round to zero.
 
     :param decimals: digits after the point
     :param max_terms: show no more than these; ``None`` for all
+    :param first: beginnings of names that stand before the others and are always shown
     """
     terms = sorted(((weight, name) for weight, name in zip(weights, names, strict=True) if weight), key=_by_size)
-    shown = [term for term in terms if round(term[0], decimals)][:max_terms]
+    ahead = [term for term in terms if first and term[1].startswith(first)]
+    others = [term for term in terms if term not in ahead and round(term[0], decimals)]
+    shown = [*ahead, *others[:max_terms]]
     return Terms(tuple(shown), len(terms) - len(shown))
 
 
