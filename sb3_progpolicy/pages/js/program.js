@@ -66,6 +66,11 @@ function formula(constant, weights, names, most, grids = []) {
   return parts.flatMap((part) => [part, " "]);
 }
 
+// One switch that does not read itself, which is shown as what turns it on and off.
+function isSwitch({ cell, readout, weightHh }) {
+  return cell === "switch" && readout.length === 1 && weightHh.every((row) => row.every((weight) => weight === 0));
+}
+
 class ProgramView {
   constructor(container, program, importance, grids) {
     Object.assign(this, { container, program, importance, grids, all: false });
@@ -112,7 +117,9 @@ class ProgramView {
     );
   }
 
-  condition({ cell, readoutBias, readout }) {
+  condition(condition) {
+    const { cell, readoutBias, readout } = condition;
+    if (isSwitch(condition)) return `${brief(readoutBias + readout[0])} while on, ${brief(readoutBias)} while off`;
     const units = readout.map((_, unit) => `h${unit + 1}`);
     if (cell !== "affine") return formula(readoutBias, readout, units, this.most());
     return formula(readoutBias, readout, this.program.inputNames, this.most(), this.grids);
@@ -130,8 +137,7 @@ class ProgramView {
   listens({ cell, readout }, index) {
     if (cell === "affine") return null;
     const condition = this.program.conditions[index];
-    const reads = cell === "switch" && condition.weightHh.some((row) => row.some((weight) => weight !== 0));
-    if (cell === "switch" && readout.length === 1 && !reads) return this.switches(condition);
+    if (isSwitch(condition)) return this.switches(condition);
     const sizes = this.importance[index].map((size, i) => [size, this.program.inputNames[i]]);
     const order = sizes.filter(([size]) => size > 0);
     const names = order.sort((a, b) => b[0] - a[0]).slice(0, 3).map(([, name]) => pretty(name));
