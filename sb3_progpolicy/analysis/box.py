@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_progpolicy.analysis.finetune import finetune, matrix_of, with_controllers
+from sb3_progpolicy.analysis.finetune import finetune, matrix_of, why_not, with_controllers
 from sb3_progpolicy.analysis.terms import Floats, Term, terms_of
 from sb3_progpolicy.evaluation import Evaluation, evaluate_program
 from sb3_progpolicy.programs.syntax import Controller, Expression, IfThenElse, ProgramData
@@ -325,6 +325,8 @@ def prune(
             found = Pruned(best, tuple(curve), len(states.inputs), episodes * len(variations), tied, tuple(notes))
             if finetune_for is None:
                 return found
+            if reason := why_not(best.program):
+                return dataclasses.replace(found, notes=(*found.notes, f"it was not trained on: {reason}"))
             train = partial(finetune, env_id=env_id, variations=variations, n_timesteps=finetune_for, seed=seed)
             return _finetuned(
                 found, partial(train, symmetries=symmetries if tied else ()), finetune_for, measure, good_enough

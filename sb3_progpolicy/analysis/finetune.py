@@ -16,6 +16,7 @@ from sb3_progpolicy.hyperparams import load_hyperparams
 from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.programs.syntax import Controller, Expression, IfThenElse, ProgramData
 from sb3_progpolicy.reptile_ppo.algorithm import ReptilePPO
+from sb3_progpolicy.reptile_ppo.initial import read_initial_program
 
 #: Share of the steps in which the critic alone learns: before it knows what the program is worth, PPO would ruin it.
 CRITIC_FIRST = 0.25
@@ -114,6 +115,18 @@ def finetune(
         for controller, mask in zip(learned.controllers, gradients.mask, strict=True)
     ]
     return with_controllers(program, trained), model.learned_by
+
+
+def why_not(program: ProgramData) -> str | None:
+    """Return why a program cannot be trained on, in a sentence; ``None`` if it can.
+
+    :param program: well formed
+    """
+    try:
+        read_initial_program(program)
+    except ValueError as error:
+        return str(error).removeprefix("init_program: ")
+    return None
 
 
 def _noise(program: ProgramData) -> LinearSchedule:

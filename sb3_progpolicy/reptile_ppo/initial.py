@@ -75,7 +75,7 @@ def _branches(program: ProgramData) -> list[IfThenElse]:
 
 
 def initial_policy_kwargs(program: Program, policy: type[BasePolicy], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of the policy that can be the program; those given are kept.
+    """Return the arguments of the policy that can be the program; those given are kept, but for too small a depth.
 
     :param program: from :func:`read_initial_program`
     :param policy: class of the policy
@@ -90,10 +90,10 @@ def initial_policy_kwargs(program: Program, policy: type[BasePolicy], given: Map
             "statistics that move with training would change what it does. Leave the observations as they are"
         )
     shape = shape_of(program)
-    fitting: dict[str, Any] = {"depth": len(program.conditions) + 1, "temperature": _temperature(program)}
+    fitting: dict[str, Any] = {"temperature": _temperature(program)}
     if shape is not None:
         fitting |= {"cell": shape[0], "condition_size": shape[1]}
-    return {**fitting, **given}
+    return {**fitting, **given, "depth": max(len(program.conditions) + 1, given.get("depth", 1))}
 
 
 def _temperature(program: Program) -> float:

@@ -1,5 +1,7 @@
 """Pruned programs trained on: what is zero stays zero, and only what is better is taken."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from sb3_progpolicy import evaluate_program, load_pretrained, simplify
 from sb3_progpolicy.analysis import box
 from sb3_progpolicy.analysis.finetune import finetune
 from sb3_progpolicy.cli import run
+from sb3_progpolicy.programs import Condition, Controller, IfThenElse
 from tests.analysis import point
 
 VARIATIONS = [{"distance": 0.5}, {"distance": 1.0}]
@@ -93,6 +96,17 @@ def test_what_is_within_the_tolerance_does_not_leave_it():
     assert not outcome((0.9, 30.0), few_steps, lambda success, steps: steps < 40).finetuned
     # A point of the curve that was asked for may be without the tolerance before and after.
     assert outcome((0.9, 60.0), few_steps, lambda success, steps: steps < 40).finetuned
+
+
+def test_program_with_a_switch_is_not_trained_and_it_is_said():
+    plain = point.slow()
+    switch = Condition(
+        "switch", ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0)), ((0.0,), (0.0,)), (-0.5, -0.5), (0.0, 0.0), (1.0,), -0.5
+    )
+    two = (Controller(((gain, 0.0, 0.0), (0.0, gain, 0.0)), (0.0, 0.0)) for gain in (-1.0, -3.0))
+    found = simplify(dataclasses.replace(plain, body=IfThenElse(switch, *two)), episodes=2, finetune=1000)
+    assert found.notes[-1] == "it was not trained on: a switch has no gradient, so that training cannot start from it"
+    assert found.program.learned_by == "imitation"
 
 
 def test_decisions_are_not_trained():

@@ -9,6 +9,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_progpolicy import ReptilePPO, load_pretrained
+from sb3_progpolicy.differentiable.initial import put_program
+from sb3_progpolicy.differentiable.module import ProgramModule
 from sb3_progpolicy.interaction import program_names
 from sb3_progpolicy.programs import Condition, Controller, IfThenElse, Program, ProgramRunner
 from sb3_progpolicy.reptile_ppo.initial import ACTION_STD, TEMPERATURE
@@ -104,6 +106,8 @@ def test_inputs_that_the_program_does_not_read_get_no_weight():
     assert program.interaction
     assert program.conditions[0].readout == (0.0, 0.0, 1.0, 0.5, *[0.0] * 4)
     assert len(program.conditions) == 1, "a graph of more layers is the program, too"
+    shallow = make(env="CartPole-v1", init_program=given, policy_kwargs={"depth": 1}).program()
+    assert len(shallow.conditions) == 1, "a depth that is too small for it, as of a file, is made to fit"
     assert all(row[4:] == (0.0,) * 4 for controller in program.controllers for row in controller.weights)
 
 
@@ -215,7 +219,6 @@ OTHER_CELL = {"init_program": cartpole(), "policy_kwargs": {"cell": "gru"}}
         ({"init_program": nested()}, "inside a then-branch"),
         ({"init_program": of_two_kinds()}, "conditions of different kinds"),
         ({"init_program": recurrent("gru", 1), "policy": "ProgPolicy"}, r"acts in box \(1,\).*discrete \(2,\)"),
-        ({"init_program": cartpole(), "policy_kwargs": {"depth": 1}}, "depth=2 is needed"),
         (
             {"init_program": cartpole(), "policy_kwargs": {"cell": "gru"}, "policy": "ProgPolicy"},
             "'affine' and size 1 does not fit",
@@ -236,6 +239,18 @@ def test_program_that_does_not_fit_is_refused(arguments, message):
         arguments.setdefault("interaction_history", False)
     with pytest.raises(ValueError, match=message):
         make(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("n_inputs", "depth", "cell", "message"),
+    [(4, 1, "affine", "depth=2 is needed"), (3, 2, "affine", "has 3 inputs"), (4, 2, "gru", "'affine' and size 1")],
+)
+def test_module_that_cannot_be_the_program_is_left_alone(n_inputs, depth, cell, message):
+    module = ProgramModule(n_inputs, cartpole().action, depth, cell)
+    before = {name: tensor.clone() for name, tensor in module.state_dict().items()}
+    with pytest.raises(ValueError, match=message):
+        put_program(module, cartpole())
+    assert all((tensor == before[name]).all() for name, tensor in module.state_dict().items())
 
 
 def test_recurrent_program_needs_a_recurrent_policy():
