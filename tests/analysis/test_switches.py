@@ -103,7 +103,7 @@ def hanoi_with_a_memory():
 
 def test_discrete_program_is_simplified_with_its_switch():
     program = hanoi_with_a_memory()
-    found = simplify(program, tie=False, time_limit=3)
+    found = simplify(program, time_limit=2)
     (switch,) = found.program.conditions
     assert switch.cell == "switch"
     assert found.notes == ()

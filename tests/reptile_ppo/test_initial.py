@@ -115,7 +115,7 @@ def test_crisp_and_soft_program_are_equal_on_the_states_it_meets():
     """But for states closer to a boundary than 20 temperatures; the tolerance is what the sigmoid leaves there."""
     program = load_pretrained("PandaPush-v0")
     model = make("PRLPolicy", "PandaPush-v0", n_envs=1, interaction_history=False, init_program="PandaPush-v0")
-    met, actions = (array.reshape(-1, array.shape[-1]) for array in episode(program, "PandaPush-v0"))
+    met, actions = (array.reshape(-1, array.shape[-1]) for array in episode(program, "PandaPush-v0", 2, 100))
     soft, _ = model.predict(met, deterministic=True)
     conditions = np.array([[*condition.readout, condition.readout_bias] for condition in program.conditions])
     values = np.c_[met, np.ones(len(met))] @ conditions.T
