@@ -60,7 +60,7 @@ SIMPLIFIED = Path(__file__).parent / "results" / "simplified"
 DEPTH = 8
 DISTILLATION_SEED, EVALUATION_SEED = 0, 10_000
 # What a unit makes of its sums and its memory: 0.5 + 0.5 * tanh(0.5 * x) for a gate, then the update.
-OPERATIONS_OF_A_UNIT = {"affine": 0, "rnn": 0, "gru": 2 * 3 + 5, "lstm": 3 * 3 + 4}
+OPERATIONS_OF_A_UNIT = {"affine": 0, "rnn": 0, "gru": 2 * 3 + 5, "lstm": 3 * 3 + 4, "switch": 2}
 Row = dict[str, Any]
 Floats = NDArray[np.floating]
 C_LOOP = """

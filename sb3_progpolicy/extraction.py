@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import (
 
 from sb3_progpolicy.interaction import VecInteractionHistory, appends_history, program_names
 from sb3_progpolicy.policies import ProgrammaticActorCritic
-from sb3_progpolicy.programs.program import Program
+from sb3_progpolicy.programs.program import LEARNED_BY, Program
 from sb3_progpolicy.programs.transform import fold_normalization
 
 # Wrappers of which a program knows what they do, or that do nothing to what it sees.
@@ -39,7 +39,8 @@ def extract_program(model: BaseAlgorithm, **metadata: Any) -> Program:
     long as ``clip_obs`` is not reached. Other wrappers are named in ``metadata["wrappers"]``.
 
     :param model: of any algorithm, with the policy ``ProgPolicy`` or ``PRLPolicy``
-    :param metadata: JSON values to keep with it; environment id, seed and number of steps are put in
+    :param metadata: JSON values to keep with it; environment id, seed, number of steps and way of
+        learning are put in
     :raises TypeError: if the policy is not a program
     :raises ValueError: if the policy reads rewards that ``VecNormalize`` has scaled
     """
@@ -54,6 +55,7 @@ def extract_program(model: BaseAlgorithm, **metadata: Any) -> Program:
         inputs, outputs = (inputs, outputs) if inputs else program_names(env)
         env_id, interaction, wrappers = env_id or env_id_of(env), appends_history(env), wrappers_of(env)
     origin = {"env": env_id, "seed": model.seed, "timesteps": model.num_timesteps}
+    origin["learned_by"] = getattr(model, "learned_by", LEARNED_BY[0])
     if wrappers:
         origin["wrappers"] = list(wrappers)
     # A saved model's tuples are loaded as lists.

@@ -1,5 +1,6 @@
 """What is kept in a run folder, whatever ends the training: resume, signals, kills, dead workers, a full disk."""
 
+import dataclasses
 import errno
 import json
 import os
@@ -8,9 +9,11 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 import yaml
 
+from sb3_progpolicy import load_pretrained
 from sb3_progpolicy.cli import run
 from sb3_progpolicy.experiment import run as runs
 from sb3_progpolicy.experiment.folder import locked, timesteps_of
@@ -59,6 +62,23 @@ def test_resume_that_is_refused_leaves_the_run_as_it_was(tmp_path, capsys):
     assert run(["train", "--resume", str(folder), "-n", "256"]) == 2
     assert "trained already: 512 of 256 steps" in capsys.readouterr().err
     assert (folder / "config.yml").read_bytes() == before
+
+
+def test_training_starts_from_a_program(tmp_path, capsys):
+    program = dataclasses.replace(load_pretrained("Hanoi-v0"), metadata={"learned_by": "imitation"})
+    program.save(tmp_path / "start.json")
+    options = ("-n", "512", "--init-program", str(tmp_path / "start.json"))
+    folder = train(tmp_path, *options)
+    learned = load_program(folder / "program.json")
+    assert learned.learned_by == "imitation+reinforcement"
+    assert len(learned.conditions) == len(program.conditions)
+    np.testing.assert_allclose(learned.controllers[0].weights, program.controllers[0].weights, atol=0.2)
+    again = train(tmp_path / "again", "-n", "64", "-i", str(folder))
+    assert load_program(again / "program.json").learned_by == "imitation+reinforcement", "-i takes it over"
+    assert run(["train", "-f", str(tmp_path), "--init-program", "Hanoi-v9"]) == 2
+    assert "Hanoi-v0" in capsys.readouterr().err
+    assert run(["train", "--resume", str(folder), *options[2:]]) == 2
+    assert "--init-program is not accepted with --resume" in capsys.readouterr().err
 
 
 def test_resume_keeps_what_it_was_given_for_the_next(tmp_path, options_of_training):

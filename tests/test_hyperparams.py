@@ -76,6 +76,7 @@ def test_linear_schedule_goes_from_one_number_to_another():
         ({"policy": "ProgPol"}, "nearest: ProgPolicy"),
         ({"policy_kwargs": {"dept": 3}}, "nearest: depth"),
         ({"gamma": "high"}, "gamma='high'"),
+        ({"init_program": 3}, "init_program=3 is not accepted; it is a file or the name of a shipped program"),
     ],
 )
 def test_slip_is_named(overrides, said):

@@ -54,7 +54,8 @@ def test_program_of_a_stock_model_reads_and_does_what_its_policy_does():
     model = PPO(ProgrammaticPolicy, env, n_steps=32, batch_size=32, seed=0, policy_kwargs={"depth": 1}).learn(96)
     assert holds_program(model)
     program = extract_program(model, note="x")
-    assert program.metadata == {"env": "CartPole-v1", "seed": 0, "timesteps": 96, "note": "x"}
+    origin = {"env": "CartPole-v1", "seed": 0, "timesteps": 96, "learned_by": "reinforcement"}
+    assert program.metadata == {**origin, "note": "x"}
     assert (program.n_observations, program.interaction, program.n_inputs) == (4, True, 8)
     runner, observations = ProgramRunner(program, 3), env.reset()
     for _ in range(20):

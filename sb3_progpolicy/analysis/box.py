@@ -6,11 +6,13 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_progpolicy.analysis.finetune import finetune, matrix_of, why_not, with_controllers
 from sb3_progpolicy.analysis.terms import Floats, Term, terms_of
 from sb3_progpolicy.evaluation import Evaluation, evaluate_program
 from sb3_progpolicy.programs.syntax import Controller, Expression, IfThenElse, ProgramData
@@ -104,8 +106,7 @@ class Pruner:
         for branch in self.reached:
             here = states.branches == branch
             controller = program.controllers[branch]
-            matrix = np.column_stack([np.array(controller.weights), np.array(controller.bias)])
-            self.target[here] = states.inputs[here] @ matrix.T
+            self.target[here] = states.inputs[here] @ matrix_of(controller).T
         self._features = [self._feature(branch, term) for branch, term in self.terms]
 
     def _feature(self, branch: int, term: Term) -> Floats:
@@ -259,6 +260,8 @@ class Pruned:
     :param episodes: from how many episodes they come
     :param tied: whether symmetries tie the weights
     :param notes: what was tried and did not succeed
+    :param finetuned: for how many environment steps the program was trained on; 0 if it was not, or nothing came of it
+    :param learned_by: how a program that was trained on was learned
     """
 
     point: Point
@@ -267,6 +270,8 @@ class Pruned:
     episodes: int
     tied: bool
     notes: tuple[str, ...]
+    finetuned: int = 0
+    learned_by: str = ""
 
 
 def prune(
@@ -279,6 +284,7 @@ def prune(
     success_tolerance: float,
     steps_tolerance: float,
     n_terms: int | None,
+    finetune_for: int | None,
     seed: int,
 ) -> Pruned:
     """Return a program of few, round weights that is as good on the training variations.
@@ -291,6 +297,7 @@ def prune(
     :param success_tolerance: by how much the share of successes may fall
     :param steps_tolerance: by what share the steps may rise
     :param n_terms: take the program of so many terms, good enough or not; ``None`` for the first that is
+    :param finetune_for: environment steps for which it is then trained on; ``None`` for none
     :param seed: of the environments
     :raises ValueError: if no program of so many terms was found
     """
@@ -305,7 +312,7 @@ def prune(
         return success_rate >= success - success_tolerance and steps_mean <= steps * (1 + steps_tolerance)
 
     notes: list[str] = []
-    if program.conditions:
+    if len(set(states.branches.tolist())) > 1:
         notes.append("conditions stay as they are")
     for tied in [True, False] if symmetries else [False]:
         curve, best = pareto(Pruner(program, states, symmetries if tied else ()), measure, good_enough)
@@ -315,10 +322,50 @@ def prune(
                 known = ", ".join(str(point.terms) for point in curve)
                 raise ValueError(f"n_terms={n_terms} is not accepted; there are programs of {known} terms")
         if best is not None:
-            return Pruned(best, tuple(curve), len(states.inputs), episodes * len(variations), tied, tuple(notes))
+            found = Pruned(best, tuple(curve), len(states.inputs), episodes * len(variations), tied, tuple(notes))
+            if finetune_for is None:
+                return found
+            if reason := why_not(best.program):
+                return dataclasses.replace(found, notes=(*found.notes, f"it was not trained on: {reason}"))
+            train = partial(finetune, env_id=env_id, variations=variations, n_timesteps=finetune_for, seed=seed)
+            return _finetuned(
+                found, partial(train, symmetries=symmetries if tied else ()), finetune_for, measure, good_enough
+            )
         notes.append(f"no {'tied ' if tied else ''}program of up to {MAX_TERMS} terms is as good")
     original = Point(0, program, success, steps)
     return Pruned(original, tuple(curve), len(states.inputs), episodes * len(variations), False, tuple(notes))
+
+
+def _finetuned(
+    pruned: Pruned,
+    train: Callable[[ProgramData], tuple[ProgramData, str]],
+    n_timesteps: int,
+    measure: Callable[[ProgramData], tuple[float, float]],
+    good_enough: Callable[[float, float], bool],
+) -> Pruned:
+    """Return what training makes of a pruned program, with the roundest numbers that make it better, or the pruned one.
+
+    :param pruned: the program
+    :param train: returns a program's trained form, and how it was learned
+    :param n_timesteps: of the training
+    :param measure: returns success rate and mean steps of a program on the training variations
+    :param good_enough: whether these are within the tolerance, which one that is within it must not leave
+    """
+    before = pruned.point
+    trained, learned_by = train(before.program)
+    for digits in _DIGITS:
+        matrices = [matrix_of(controller) for controller in trained.controllers]
+        candidate = with_controllers(
+            trained, [rounded(matrix.ravel(), digits).reshape(matrix.shape) for matrix in matrices]
+        )
+        success, steps = measure(candidate)
+        better = (success, -steps) > (before.success_rate, -before.steps_mean)
+        kept = good_enough(success, steps) or not good_enough(before.success_rate, before.steps_mean)
+        if better and kept:
+            point = Point(before.terms, candidate, success, steps)
+            return dataclasses.replace(pruned, point=point, finetuned=n_timesteps, learned_by=learned_by)
+    note = f"{n_timesteps} steps of training made it no better ({success:.0%}, {steps:g} steps)"
+    return dataclasses.replace(pruned, notes=(*pruned.notes, note))
 
 
 def _means(rows: Sequence[Evaluation]) -> tuple[float, float]:

@@ -12,23 +12,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progpolicy_envs import Domain, get_domain
-from progpolicy_envs.symmetry import Symmetry
 from sb3_progpolicy.analysis.box import Point, Pruned, prune
-from sb3_progpolicy.analysis.integer import MAX_WEIGHT, Solution, fewest_terms
-from sb3_progpolicy.analysis.situations import Situations, meet
-from sb3_progpolicy.analysis.terms import Floats, Term, terms_of
+from sb3_progpolicy.analysis.integer import MAX_WEIGHT
+from sb3_progpolicy.analysis.rules import Rules, count_numbers
+from sb3_progpolicy.analysis.situations import Situations, meet, meet_in
+from sb3_progpolicy.analysis.switches import disagreements, replace_switches
 from sb3_progpolicy.evaluation import refuse_wrappers
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.programs.interpreter import ProgramRunner
 from sb3_progpolicy.programs.io import program_digest
 from sb3_progpolicy.programs.program import Program
-from sb3_progpolicy.programs.syntax import Condition, Controller, Expression, IfThenElse, ProgramData
+from sb3_progpolicy.programs.syntax import ProgramData
 
 EquallyGood = Literal["program", "planner"]
 #: What is said of a point of a curve.
 CURVE = ("terms", "success_rate", "steps_mean")
 #: How often situations that only the simplified program meets are added.
 _ROUNDS = 8
+#: Episodes on each variation by which conditions with a memory are looked at.
+MAX_SWITCH_EPISODES = 20
 
 
 @dataclass(frozen=True)
@@ -71,16 +73,6 @@ class Simplification:
         return {**plain, "notes": list(self.notes), "curve": curve}
 
 
-def count_numbers(program: ProgramData) -> int:
-    """Return how many numbers of a program are not zero."""
-    return sum(map(_count, program.conditions)) + sum(map(_count, program.controllers))
-
-
-def _count(node: Condition | Controller) -> int:
-    numbers = [value for value in vars(node).values() if not isinstance(value, str)]
-    return sum(int(np.count_nonzero(np.array(value))) for value in numbers)
-
-
 def simplify(
     program: ProgramData,
     env_id: str | None = None,
@@ -95,6 +87,7 @@ def simplify(
     success_tolerance: float = 0.01,
     steps_tolerance: float = 0.05,
     n_terms: int | None = None,
+    finetune: int | None = None,
     seed: int = 0,
 ) -> Simplification:
     """Return the program with the fewest whole numbers that makes the same decisions on training variations.
@@ -102,12 +95,14 @@ def simplify(
     The distinct inputs that the program meets are constraints of a mixed-integer linear program, whose bound says
     how few terms any program of the same form needs. Its form: the conditions and branches of the original, weights
     that are whole numbers up to ``max_weight``, tied over the domain's symmetries if that is possible, and functions of
-    row and column on grids. Recurrent conditions stay as they are.
+    row and column on grids. A recurrent condition of one unit becomes a switch, "on when ..., off when ...", if
+    one has the same decisions at every step of whole episodes; others stay as they are.
 
     With Box actions no numbers do exactly the same. There terms are added one by one, those first that bring the
     actions nearest to the original's, fitted by least squares on the states that the original meets and rounded, until
     success and steps on the training variations are within a tolerance; then those are left out again without which
-    they still are. Branches that never act are dropped.
+    they still are. Branches that never act are dropped. If asked, PPO then trains the numbers of the controllers that
+    are left; what comes of it is taken if success and steps on the training variations are better.
 
     :param program: acts in a Discrete space or a Box
     :param env_id: id of a planning domain; by default the one in the program's metadata
@@ -122,6 +117,7 @@ def simplify(
     :param success_tolerance: with Box actions, by how much the share of successes may fall
     :param steps_tolerance: with Box actions, by what share the steps may rise
     :param n_terms: with Box actions, take the program of so many terms, good enough or not
+    :param finetune: with Box actions, environment steps of that training; ``None`` for none
     :param seed: of the drawn starts
     :raises ValueError: if an argument is not accepted
     """
@@ -131,15 +127,29 @@ def simplify(
         raise ValueError("the program does not say which environment it is for; give env_id")
     if equally_good not in ("program", "planner"):
         raise unknown("equally_good", equally_good, ("program", "planner"))
+    if finetune is not None and finetune < 1:
+        raise ValueError(f"finetune={finetune} is not accepted; it is at least 1")
     if program.action.kind not in ("discrete", "box"):
         raise ValueError(f"{program.action.kind} actions are not accepted here; Discrete and Box ones are")
     refuse_wrappers("the program", program.metadata.get("wrappers", ()))
     domain = get_domain(env_id)
     variations = domain.trained if variations is None else variations
+    symmetries = domain.symmetries if tie else ()
+    switched = replace_switches(
+        program,
+        env_id,
+        variations,
+        symmetries,
+        domain.grids,
+        episodes=min(episodes, MAX_SWITCH_EPISODES),
+        time_limit=time_limit,
+        max_weight=max_weight,
+        seed=seed,
+    )
+    original, program = program, switched.program
     if program.action.kind == "box":
         if equally_good != "program":
             raise ValueError(f"equally_good={equally_good!r} is not accepted for Box actions; it is for Discrete ones")
-        symmetries = domain.symmetries if tie else ()
         pruned = prune(
             program,
             env_id,
@@ -149,18 +159,23 @@ def simplify(
             success_tolerance=success_tolerance,
             steps_tolerance=steps_tolerance,
             n_terms=n_terms,
+            finetune_for=finetune,
             seed=seed,
         )
-        return _of_pruned(program, pruned, domain, began)
+        return _of_pruned(original, pruned, domain, began)
     if n_terms is not None:
         raise ValueError(f"n_terms={n_terms} is not accepted for Discrete actions; the fewest are found")
+    if finetune is not None:
+        raise ValueError(f"finetune={finetune} is not accepted for Discrete actions; their decisions stay the same")
     planner = equally_good == "planner"
     situations = meet(program, env_id, variations, n_starts, planner, seed)
     if not len(situations.inputs):
         raise ValueError("the program meets no situation; its variations are solved at the start")
+    if not planner:
+        situations = meet_in(program, switched.traces, situations)
     notes: list[str] = []
     for number in range(_ROUNDS):
-        rules = _Rules(program, situations, domain, tie, time_limit, max_weight)
+        rules = Rules(program, situations, domain, tie, time_limit, max_weight, switched)
         small = rules.program()
         met = meet(small, env_id, variations, n_starts, planner, seed + number, situations)
         met = _relabelled(met, len(situations.inputs), program, planner)
@@ -171,11 +186,13 @@ def simplify(
         situations = met
     else:
         notes.append(f"in {int(wrong.sum())} of {len(met.inputs)} situations it decides otherwise")
+    if not planner and (n_other := disagreements(program, small, switched.traces)):
+        notes.append(f"in {n_other} steps of whole episodes it decides otherwise")
     notes = [*rules.notes, *notes]
     metadata = dict(program.metadata)
-    if small.body != program.body:
+    if small.body != original.body:
         metadata["simplified"] = {
-            "from": program_digest(program),
+            "from": program_digest(original),
             "terms": rules.n_terms,
             "terms_lower_bound": rules.lower_bound,
             "symmetry": rules.symmetry,
@@ -188,7 +205,7 @@ def simplify(
             ]
     return Simplification(
         program=Program(**{**vars(small), "metadata": metadata}),
-        terms_before=count_numbers(program),
+        terms_before=count_numbers(original),
         terms_after=rules.n_terms,
         terms_lower_bound=rules.lower_bound,
         tied=rules.symmetry is not None,
@@ -209,6 +226,9 @@ def _of_pruned(program: ProgramData, pruned: Pruned, domain: Domain, began: floa
     metadata = dict(program.metadata)
     if small.body != program.body:
         metadata["simplified"] = {"from": program_digest(program), "terms": terms, "symmetry": symmetry}
+    if pruned.finetuned:
+        metadata["simplified"]["finetuned"] = pruned.finetuned
+        metadata["learned_by"] = pruned.learned_by
     return Simplification(
         program=Program(**{**vars(small), "metadata": metadata}),
         terms_before=count_numbers(program),
@@ -254,118 +274,3 @@ def _wrong(program: ProgramData, situations: Situations) -> NDArray[np.bool_]:
     actions = ProgramRunner(program, len(situations.inputs)).act(situations.inputs) - program.action.start
     wrong = ~situations.allowed[np.arange(len(actions)), actions]
     return np.asarray(wrong & situations.allowed.any(axis=1))
-
-
-class _Rules:
-    """The conditions and controllers of a program, each made small.
-
-    :param program: the original
-    :param situations: that constrain them
-    :param domain: whose symmetries and grids they may use
-    :param tie: whether to tie weights
-    :param time_limit: seconds for each
-    :param max_weight: largest size of a weight
-    """
-
-    def __init__(
-        self,
-        program: ProgramData,
-        situations: Situations,
-        domain: Domain,
-        tie: bool,
-        time_limit: float,
-        max_weight: int,
-    ) -> None:
-        self.original, self.situations, self.domain = program, situations, domain
-        self.time_limit, self.max_weight = time_limit, max_weight
-        self.notes: list[str] = []
-        self.n_terms, self.lower_bound = 0, 0
-        self.symmetry: str | None = None
-        self.ties: list[bool] = []
-        self.tie = tie and bool(domain.symmetries)
-
-    def program(self) -> ProgramData:
-        """Return the program of the small rules."""
-        original = self.original
-        reached = sorted(set(self.situations.branches.tolist()) - {-1}) or list(range(len(original.controllers)))
-        recurrent = any(condition.cell != "affine" for condition in original.conditions)
-        if recurrent or (self.situations.branches == -1).any():
-            reached = list(range(len(original.controllers)))
-        controllers = {index: self._controller(index) for index in reached}
-        body: Expression = controllers[reached[-1]]
-        for index in reversed(reached[:-1]):
-            body = IfThenElse(self._condition(index), controllers[index], body)
-        self.symmetry = self.domain.symmetries[0].name if self.ties and all(self.ties) else None
-        return dataclasses.replace(original, body=body)
-
-    def _controller(self, index: int) -> Controller:
-        original = self.original.controllers[index]
-        here = self.situations.branches == index
-        inputs, allowed = self.situations.inputs[here], self.situations.allowed[here]
-        undecided = ~allowed.any(axis=1)
-        if undecided.any():
-            self.notes.append(f"{int(undecided.sum())} inputs belong to states in which no one action is good")
-
-        def rows(terms: Sequence[Term]) -> Floats:
-            return _preferences(terms, inputs[~undecided], allowed[~undecided])
-
-        solution, terms, tied = self._solve(rows, self.original.action.n_outputs, f"controller {index + 1}")
-        self.ties.append(tied)
-        if solution is None:
-            self.n_terms += _count(original)
-            return original
-        matrix = _summed(solution, terms)
-        return Controller(tuple(map(tuple, matrix[:, :-1].tolist())), tuple(matrix[:, -1].tolist()))
-
-    def _condition(self, index: int) -> Condition:
-        original = self.original.conditions[index]
-        if original.cell != "affine":
-            self.n_terms += _count(original)
-            self.notes.append(f"condition {index + 1} has a memory and stays as it is")
-            return original
-        reaching = self.situations.branches >= index
-        inputs, true = self.situations.inputs[reaching], self.situations.branches[reaching] == index
-
-        def rows(terms: Sequence[Term]) -> Floats:
-            values = _with_constant(inputs) @ np.concatenate([term.weights for term in terms]).T
-            return np.where(true, 1, -1)[:, None] * values
-
-        solution, terms, tied = self._solve(rows, 1, f"condition {index + 1}")
-        self.ties.append(tied)
-        if solution is None:
-            self.n_terms += _count(original)
-            return original
-        (weights,) = _summed(solution, terms)
-        return dataclasses.replace(original, readout=tuple(weights[:-1].tolist()), readout_bias=float(weights[-1]))
-
-    def _solve(self, rows: Any, n_outputs: int, name: str) -> tuple[Solution | None, list[Term], bool]:
-        attempts: list[tuple[bool, Sequence[Symmetry]]] = [(True, self.domain.symmetries)] if self.tie else []
-        for tied, symmetries in [*attempts, (False, ())]:
-            for grids in [self.domain.grids, ()] if self.domain.grids else [()]:
-                terms = terms_of(self.original, n_outputs, symmetries, grids)
-                solution = fewest_terms(rows(terms), self.time_limit, max_weight=self.max_weight)
-                if solution is not None:
-                    self.n_terms += solution.n_terms
-                    self.lower_bound += solution.lower_bound
-                    return solution, terms, tied
-            self.notes.append(
-                f"{name}: no {'tied ' if tied else ''}rule of whole numbers up to {self.max_weight} was found that "
-                "makes the same decisions"
-            )
-        return None, [], False
-
-
-def _with_constant(inputs: Floats) -> Floats:
-    return np.column_stack([inputs, np.ones(len(inputs))])
-
-
-def _preferences(terms: Sequence[Term], inputs: Floats, allowed: NDArray[np.bool_]) -> Floats:
-    """Return the rows of what has to be positive: an allowed action's score less another one's."""
-    scores = np.einsum("koi,ni->nok", np.stack([term.weights for term in terms]), _with_constant(inputs))
-    rows, good, bad = np.nonzero(allowed[:, :, None] & ~allowed[:, None, :])
-    return np.asarray(scores[rows, good] - scores[rows, bad])
-
-
-def _summed(solution: Solution, terms: Sequence[Term]) -> Floats:
-    matrix = np.einsum("k,koi->oi", solution.weights, np.stack([term.weights for term in terms]))
-    return np.asarray(matrix + 0.0)  # no negative zeros

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from progpolicy_envs.vector import PlanningVectorEnv
 from sb3_progpolicy.analysis.rollout import Step, batches, cap_of, make_batch, run_episodes, start_numbers
+from sb3_progpolicy.programs.interpreter import ProgramRunner
 from sb3_progpolicy.programs.syntax import ProgramData
 
 BATCH = 512
@@ -20,9 +21,9 @@ BATCH = 512
 class Situations:
     """Distinct inputs, and the actions that may be chosen on them.
 
-    :param inputs: X, ``(n, n_inputs)``, no two rows equal
+    :param inputs: X, ``(n, n_inputs)``; rows are equal only where the branch depends on memory
     :param allowed: ``(n, n_actions)``
-    :param branches: index of the controller that is reached, ``(n,)``; -1 where it depends on memory
+    :param branches: index of the controller that is reached, ``(n,)``
     :param starts: from how many starts they come
     :param exhaustive: whether these were all starts
     """
@@ -43,12 +44,13 @@ class _Collector:
 
     def __init__(self, program: ProgramData, planner: bool) -> None:
         self.planner, self.n_actions = planner, program.action.n_outputs
-        self.found: dict[bytes, NDArray[np.bool_]] = {}
-        self.branches: dict[bytes, int] = {}
+        self.remembers = any(condition.cell != "affine" for condition in program.conditions)
+        self.found: dict[tuple[bytes, int], NDArray[np.bool_]] = {}
+        self.branches: list[int] = []
         self.inputs: list[NDArray[np.float64]] = []
 
     def __call__(self, step: Step) -> None:
-        keys = [row.tobytes() for row in step.inputs]
+        keys = [self.key(*pair) for pair in zip(step.inputs, step.branches.tolist(), strict=True)]
         rows = [row for row in np.flatnonzero(step.active).tolist() if self.planner or keys[row] not in self.found]
         if not rows:
             return
@@ -61,11 +63,29 @@ class _Collector:
             key = keys[row]
             if key in self.found:
                 self.found[key] = self.found[key] & mask  # two states that look alike
-                if self.branches[key] != step.branches[row]:
-                    self.branches[key] = -1
             else:
-                self.found[key], self.branches[key] = mask, int(step.branches[row])
-                self.inputs.append(step.inputs[row])
+                self.add(step.inputs[row], int(step.branches[row]), mask)
+
+    def key(self, inputs: NDArray[np.float64], branch: int) -> tuple[bytes, int]:
+        """Return what tells situations apart: X and, where it does not follow from X, the branch."""
+        return inputs.tobytes(), branch if self.remembers else 0
+
+    def add(self, inputs: NDArray[np.float64], branch: int, allowed: NDArray[np.bool_]) -> None:
+        """Add a situation that is not known yet."""
+        self.found[self.key(inputs, branch)] = allowed
+        self.inputs.append(inputs)
+        self.branches.append(branch)
+
+    def add_known(self, known: Situations) -> None:
+        """Add situations, to which others are then added."""
+        for row, mask, branch in zip(known.inputs, known.allowed, known.branches.tolist(), strict=True):
+            self.add(row, branch, mask)
+
+    def situations(self, program: ProgramData, starts: int, exhaustive: bool) -> Situations:
+        """Return what was collected, in the order in which it was met."""
+        inputs = np.array(self.inputs).reshape(-1, program.n_inputs)
+        allowed = np.array(list(self.found.values())).reshape(-1, program.action.n_outputs)
+        return Situations(inputs, allowed, np.array(self.branches, dtype=np.int64), starts, exhaustive)
 
 
 def good_actions(states: Sequence[Mapping[str, Any]], like: PlanningVectorEnv) -> NDArray[np.bool_]:
@@ -106,9 +126,7 @@ def meet(
     """
     collector = _Collector(program, planner)
     if known is not None:
-        for row, mask, branch in zip(known.inputs, known.allowed, known.branches.tolist(), strict=True):
-            collector.found[row.tobytes()], collector.branches[row.tobytes()] = mask, branch
-            collector.inputs.append(row)
+        collector.add_known(known)
     rng, cap = np.random.default_rng(seed), cap_of(env_id)
     starts, exhaustive = 0, True
     for variation in variations:
@@ -120,8 +138,23 @@ def meet(
             observations = venv.reset_to(variation, part)
             run_episodes(program, venv, observations, venv.optimal_steps(), cap, collector)
         starts += len(numbers)
-    inputs = np.array(collector.inputs).reshape(-1, program.n_inputs)
-    keys = [row.tobytes() for row in inputs]
-    allowed = np.array([collector.found[key] for key in keys]).reshape(-1, program.action.n_outputs)
-    branches = np.array([collector.branches[key] for key in keys], dtype=np.int64)
-    return Situations(inputs, allowed, branches, starts, exhaustive)
+    return collector.situations(program, starts, exhaustive)
+
+
+def meet_in(program: ProgramData, traces: Sequence[NDArray[np.float64]], known: Situations) -> Situations:
+    """Return situations and those of whole episodes, in which the memory is kept from one to the next.
+
+    :param program: crisp
+    :param traces: X of the episodes, ``(n_steps, n_envs, n_inputs)`` each
+    :param known: situations
+    """
+    collector = _Collector(program, planner=False)
+    collector.add_known(known)
+    for trace in traces:
+        runner = ProgramRunner(program, trace.shape[1])
+        for inputs in trace:
+            actions = runner.act(inputs) - program.action.start
+            for row, branch, action in zip(inputs, runner.branch.tolist(), actions.tolist(), strict=True):
+                if collector.key(row, branch) not in collector.found:
+                    collector.add(row, branch, np.arange(collector.n_actions) == action)
+    return collector.situations(program, known.starts, known.exhaustive)

@@ -53,6 +53,19 @@ def terms_of(
     return found
 
 
+def symmetric_part(program: ProgramData, matrix: Floats, symmetries: Sequence[Symmetry]) -> Floats:
+    """Return the part of a controller's numbers that is the same from all sides: their mean over the group.
+
+    :param program: whose inputs the controller reads
+    :param matrix: weights and constant, ``(n_outputs, n_inputs + 1)``
+    :param symmetries: generators of the group; none for the matrix as it is
+    """
+    if not symmetries:
+        return matrix
+    group = [(_on_inputs(program, one), _on_outputs(one, len(matrix))) for one in group_of(symmetries)]
+    return np.asarray(np.mean([outputs @ matrix @ inputs.T for inputs, outputs in group], axis=0))
+
+
 def _add(found: list[Term], span: Floats, pattern: Floats, group: Sequence[tuple[Floats, Floats]]) -> Floats:
     """Add the symmetric part of a pattern, unless there is none or it follows from those found."""
     tied = pattern if not group else np.sum([outputs @ pattern @ inputs.T for inputs, outputs in group], axis=0)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -12,12 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progpolicy_envs import find_domain
-from sb3_progpolicy.analysis.rollout import batches, cap_of, make_batch, run_episodes, start_numbers
+from sb3_progpolicy.analysis.checkpoint import Checkpoint
+from sb3_progpolicy.analysis.rollout import cap_of, make_batch, run_episodes, start_numbers
 from sb3_progpolicy.evaluation import refuse_wrappers
 from sb3_progpolicy.programs.interpreter import ProgramRunner, join_inputs
 from sb3_progpolicy.programs.io import program_digest
 from sb3_progpolicy.programs.syntax import ProgramData
 
+#: Numbers of starts: all of them, or those drawn.
+Numbers = range | NDArray[np.int64]
 BATCH = 8192
 #: Starts that are gone through one by one, at most; where there are more, some are drawn.
 MAX_STARTS = 10_000_000
@@ -67,6 +72,7 @@ def verify(
     max_steps: int | None = None,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
 ) -> list[Verification]:
     """Run the crisp program once from every start of each variation, its memory being empty.
 
@@ -84,8 +90,9 @@ def verify(
     :param max_steps: cap on the steps of an episode in place of the registered one; an optimal solution always fits
     :param seed: of the draw
     :param progress: is called with the number of starts done and that of all of a variation
+    :param checkpoint: file in which the counts are kept; one that exists is gone on from, with the same arguments
     :return: one row for each variation
-    :raises ValueError: if an argument is not accepted
+    :raises ValueError: if an argument is not accepted, or the file is of another verification
     """
     env_id = env_id or str(program.metadata.get("env") or "")
     if not env_id:
@@ -99,18 +106,31 @@ def verify(
     if variations is None:
         variations = [{}] if domain is None else domain.trained
     rng = np.random.default_rng(seed)
-    rows = []
-    for variation in variations:
+    given = {"from_any_state": from_any_state, "all_starts": all_starts, "n_starts": n_starts, "max_steps": max_steps}
+    listed = [dict(variation) for variation in variations]
+    origin = {"program": program_digest(program), "env": env_id, "variations": listed, **given, "seed": seed}
+    kept = Checkpoint(None if checkpoint is None else Path(checkpoint), origin)
+    rows = [Verification(**row) for row in kept.rows]
+    for place, variation in enumerate(listed):
         counted = _count(program, env_id, variation, from_any_state)
         if counted is None:
             if all_starts:
                 raise ValueError(f"all_starts is not accepted for {env_id} {dict(variation)}; they cannot be counted")
-            drawn = N_DRAWN if n_starts is None else n_starts
-            rows.append(_sampled(program, env_id, variation, drawn, max_steps, int(rng.integers(2**31)), progress))
-            continue
-        limit = n_starts if all_starts or n_starts is not None or counted <= MAX_STARTS else N_DRAWN
-        numbers = start_numbers(counted, limit, rng)
-        rows.append(_counted(program, env_id, variation, numbers, counted, from_any_state, max_steps, progress))
+            drawn, first_seed = N_DRAWN if n_starts is None else n_starts, int(rng.integers(2**31))
+            if place < len(kept.rows):
+                continue
+            rows.append(_sampled(program, env_id, variation, drawn, max_steps, first_seed, progress))
+        else:
+            limit = n_starts if all_starts or n_starts is not None or counted <= MAX_STARTS else N_DRAWN
+            numbers: Numbers = range(counted)
+            if limit is not None and counted > limit:
+                numbers = start_numbers(counted, limit, rng)
+            if place < len(kept.rows):
+                continue
+            rows.append(
+                _counted(program, env_id, variation, numbers, counted, from_any_state, max_steps, progress, kept)
+            )
+        kept.row(rows[-1].to_json())
     return rows
 
 
@@ -133,15 +153,18 @@ def _counted(
     program: ProgramData,
     env_id: str,
     variation: Mapping[str, Any],
-    numbers: NDArray[np.int64],
+    numbers: Numbers,
     count: int,
     any_state: bool,
     max_steps: int | None,
     progress: Callable[[int, int], None] | None,
+    kept: Checkpoint,
 ) -> Verification:
     tally = _Tally()
+    vars(tally).update(kept.counts)
     venv = make_batch(program, env_id, min(BATCH, len(numbers)))
-    for part in batches(numbers, BATCH):
+    for first in range(tally.starts, len(numbers), BATCH):
+        part = np.asarray(numbers[first : first + BATCH], dtype=np.int64)
         if len(part) != venv.num_envs:
             venv = make_batch(program, env_id, len(part))
         observations = venv.reset_to(variation, part, any_state)
@@ -153,6 +176,7 @@ def _counted(
             one = make_batch(program, env_id, 1)
             one.reset_to(variation, part[shortest : shortest + 1], any_state)
             tally.counterexample = {"options": one.state_of(0)}
+        kept.count(vars(tally))
         if progress is not None:
             progress(tally.starts, len(numbers))
     return tally.row(variation, exhaustive=len(numbers) == count)
@@ -203,7 +227,7 @@ class _Tally:
         self.starts = self.solved = self.n_optimal = 0
         self.has_planner = True
         self.worst: float | None = None
-        self.shortest = np.inf
+        self.shortest: float | None = None  # optimal steps of the counterexample
         self.counterexample: dict[str, Any] | None = None
 
     def add(self, steps: NDArray[np.int64], optimal: NDArray[np.float64]) -> int | None:
@@ -227,7 +251,7 @@ class _Tally:
         if not len(failed):
             return None
         lengths = np.nan_to_num(optimal[failed], nan=1e9)
-        if lengths.min() >= self.shortest:
+        if self.shortest is not None and lengths.min() >= self.shortest:
             return None
         self.shortest = float(lengths.min())
         return int(failed[lengths.argmin()])

@@ -36,6 +36,9 @@ def simplify(
     terms: Annotated[
         int | None, typer.Option("--terms", min=1, help="continuous actions: take the program of so many terms")
     ] = None,
+    finetune: Annotated[
+        int | None, typer.Option("--finetune", min=1, help="continuous actions: then train it on for so many steps")
+    ] = None,
     curve: Annotated[
         Path | None, typer.Option("--curve", help="continuous actions: .csv or .png of terms against success and steps")
     ] = None,
@@ -69,6 +72,7 @@ def simplify(
             time_limit=time_limit,
             max_weight=max_weight,
             n_terms=terms,
+            finetune=finetune,
             seed=seed,
         )
         if curve is not None:

@@ -18,7 +18,7 @@ from sb3_progpolicy.hyperparams import algorithms
 # Flags that decide the outcome, which a resumed run takes from its folder.
 _DECIDED = (
     *("--algo", "--env", "--seed", "--hyperparams", "--env-kwargs", "--trained-agent", "--device"),
-    *("--log-folder", "--tensorboard-log"),
+    *("--log-folder", "--tensorboard-log", "--init-program"),
 )
 
 
@@ -41,6 +41,9 @@ def train(
     progress: Annotated[bool, typer.Option("-P", "--progress", help="show a progress bar")] = False,
     trained_agent: Annotated[
         str, typer.Option("-i", "--trained-agent", help="start from the parameters of a model (.zip or run folder)")
+    ] = "",
+    init_program: Annotated[
+        str, typer.Option("--init-program", help="start from a program: a .json file, run folder or shipped name")
     ] = "",
     resume: Annotated[
         Path | None, typer.Option("--resume", help="run folder to go on with, from its last checkpoint")
@@ -86,7 +89,10 @@ def train(
                 secrets.randbelow(2**31) if seed < 0 else seed,
                 n_timesteps,
                 parse_pairs("--env-kwargs", env_kwargs or ()),
-                parse_pairs("--hyperparams", hyperparams or ()),
+                {
+                    **parse_pairs("--hyperparams", hyperparams or ()),
+                    **({"init_program": init_program} if init_program else {}),
+                },
                 device,
             )
             model, wrapper = run.build_model(config, tensorboard_log or None, max(0, verbose - 1))

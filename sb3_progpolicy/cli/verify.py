@@ -43,7 +43,8 @@ def verify(
 ) -> None:
     """Run a program from every start of a variation, and say from which it fails.
 
-    Exit code 1 if it fails anywhere. Where starts cannot be counted, as in physics, some are drawn.
+    Exit code 1 if it fails anywhere. Where starts cannot be counted, as in physics, some are drawn. With -o and a
+    certificate, an interrupted run goes on when it is started again.
     """
     from sb3_progpolicy.analysis.verify import certificate
     from sb3_progpolicy.programs.files import write_atomically
@@ -54,17 +55,20 @@ def verify(
             raise ValueError(f"-o {str(output)!r} is not accepted; give a certificate (.json) or a film (.gif)")
     if all_starts and starts is not None:
         raise ValueError("--all-starts and --starts are not accepted together")
+    is_certificate = output is not None and output.suffix.lower() == ".json"
+    state = output.with_suffix(".state.json") if output is not None and is_certificate else None
     with quiet_stdout():
         program, env_id = find_program(run_or_name, env, allow_pickle)
-        rows = _verified(program, env_id, variations, all_starts, from_any_state, starts, seed)
+        rows = _verified(program, env_id, variations, all_starts, from_any_state, starts, seed, state)
     if as_json:
         typer.echo(json.dumps([row.to_json() for row in rows], indent=1))
     else:
         _print_table(env_id, rows)
     failing = [row for row in rows if row.counterexample is not None]
-    if output is not None and output.suffix.lower() == ".json":
+    if output is not None and state is not None:
         command = shlex.join(["progpolicy", *sys.argv[1:]])
         write_atomically(output, json.dumps(certificate(program, env_id, rows, command), indent=1) + "\n")
+        state.unlink(missing_ok=True)
     elif output is not None and failing:
         from sb3_progpolicy.experiment.film import record
 
@@ -86,6 +90,7 @@ def _verified(
     any_state: bool,
     starts: int | None,
     seed: int,
+    state: Path | None,
 ) -> list[Verification]:
     from rich.console import Console
     from rich.progress import Progress
@@ -108,6 +113,7 @@ def _verified(
             n_starts=starts,
             seed=seed,
             progress=progress,
+            checkpoint=state,
         )
 
 

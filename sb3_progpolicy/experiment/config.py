@@ -211,6 +211,8 @@ def _checked(name: str, value: Any, default: Any) -> Any:
     value = parse_number(value)
     if name == "policy_kwargs":
         return parse_kwargs(name, value)
+    if name == "init_program" and value is not None and not isinstance(value, str):
+        raise ValueError(f"{name}={shortened(value)} is not accepted; it is a file or the name of a shipped program")
     if value is None and (default is None or name == "batch_size"):
         return None
     if name in _SCHEDULES:

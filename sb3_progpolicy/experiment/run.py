@@ -261,11 +261,13 @@ def start_from(model: BaseAlgorithm, trained: str | Path, allow_pickle: bool = F
     :raises ValueError: if the policies differ in shape
     """
     path = Path(trained) / MODEL if Path(trained).is_dir() else Path(trained)
-    state = load_model(path, device=model.device, allow_pickle=allow_pickle).policy.state_dict()
+    start = load_model(path, device=model.device, allow_pickle=allow_pickle)
     try:
-        model.policy.load_state_dict(state)
+        model.policy.load_state_dict(start.policy.state_dict())
     except RuntimeError:
         raise ValueError(f"{trained} does not fit; its policy has other layers than the one to be trained") from None
+    if hasattr(start, "learned_by"):
+        model.learned_by = start.learned_by  # type: ignore[attr-defined]
 
 
 class _EvaluateVariations(BaseCallback):

@@ -15,6 +15,7 @@ import numpy as np
 
 from progpolicy_envs import Domain, find_domain
 from sb3_progpolicy.pages.episodes import WORLDS, fits, record_episodes
+from sb3_progpolicy.programs.export.grids import blocks_of
 from sb3_progpolicy.programs.export.javascript import escaped_json, export_javascript
 from sb3_progpolicy.programs.export.visitor import action_rule, counted, deliver, input_importance, title
 from sb3_progpolicy.programs.syntax import ProgramData
@@ -93,6 +94,7 @@ def _content(program: ProgramData, env: gym.Env[Any, Any] | None, domain: Domain
     data: dict[str, Any] = {
         "world": None,
         "episodes": [],
+        "grids": [vars(block) for block in blocks_of(program)],
         "importance": [input_importance(condition) for condition in program.conditions],
     }
     sections: list[tuple[str, str]] = []

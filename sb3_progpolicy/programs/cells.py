@@ -1,4 +1,4 @@
-"""One step of each recurrent cell in NumPy, with the equations and the gate order of PyTorch."""
+"""One step of each recurrent cell in NumPy, with the equations and the gate order of PyTorch; and of the switch."""
 
 from __future__ import annotations
 
@@ -41,5 +41,20 @@ def lstm_step(gates: Array, recurrent: Array, hidden: Array, cell: Array, tanh: 
     return o * tanh(cell), cell
 
 
+def switch_step(
+    gates: Array, recurrent: Array, hidden: Array, cell: Array, tanh: Tanh = np.tanh
+) -> tuple[Array, Array]:
+    """Advance a switch: on, off or as it was. See :data:`STEPS`."""
+    units = hidden.shape[-1]
+    total = gates + recurrent
+    on, off = total[..., :units] >= 0, total[..., units:] >= 0
+    return np.where(on, 1.0, np.where(off, 0.0, hidden)), cell
+
+
 #: Cell name to its step: ``step(W_ih x + b_ih, W_hh h + b_hh, h, c, tanh) -> (h, c)``, arrays ``(..., width)``.
-STEPS: dict[Cell, Callable[..., tuple[Array, Array]]] = {"rnn": rnn_step, "gru": gru_step, "lstm": lstm_step}
+STEPS: dict[Cell, Callable[..., tuple[Array, Array]]] = {
+    "rnn": rnn_step,
+    "gru": gru_step,
+    "lstm": lstm_step,
+    "switch": switch_step,
+}

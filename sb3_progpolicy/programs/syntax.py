@@ -10,7 +10,7 @@ from sb3_progpolicy.spaces import ActionSpec
 
 Vector = tuple[float, ...]
 Matrix = tuple[Vector, ...]
-Cell = Literal["affine", "rnn", "gru", "lstm"]
+Cell = Literal["affine", "rnn", "gru", "lstm", "switch"]
 BoxSemantics = Literal["means", "branches"]
 BOX_SEMANTICS: tuple[BoxSemantics, ...] = ("means", "branches")
 
@@ -20,6 +20,7 @@ GATES: dict[Cell, tuple[str, ...]] = {
     "rnn": ("h",),
     "gru": ("r", "z", "n"),
     "lstm": ("i", "f", "g", "o"),
+    "switch": ("on", "off"),
 }
 
 
@@ -40,9 +41,11 @@ class Condition:
     """The test ``B ::= RNN(X) >= 0`` (figure 1): a recurrent cell with a state of its own and an affine readout.
 
     One step is ``h = cell(x, h)``, then ``B = readout · h + readout_bias``. For the cell ``"affine"`` there is no
-    state and ``B = readout · x + readout_bias``.
+    state and ``B = readout · x + readout_bias``. A unit of the cell ``"switch"`` is 1 from the step on in which its sum
+    *on* is not below 0, and 0 from the step on in which *off* is not and *on* is; else it stays as it was. It has no
+    gradient, so that it is not trained but found (:func:`~sb3_progpolicy.simplify`) or written by hand.
 
-    :param cell: ``"rnn"`` (tanh), ``"gru"``, ``"lstm"`` with PyTorch's equations, or ``"affine"``
+    :param cell: ``"rnn"`` (tanh), ``"gru"``, ``"lstm"`` with PyTorch's equations, ``"switch"``, or ``"affine"``
     :param weight_ih: ``(n_gates * hidden_size, n_inputs)``, gates stacked in PyTorch's order; empty for ``"affine"``
     :param weight_hh: ``(n_gates * hidden_size, hidden_size)``
     :param bias_ih: ``(n_gates * hidden_size,)``

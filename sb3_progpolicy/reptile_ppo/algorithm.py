@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
@@ -18,18 +19,19 @@ from sb3_progpolicy.extraction import env_id_of, extract_program, wrappers_of
 from sb3_progpolicy.interaction import program_names
 from sb3_progpolicy.normalization import NormalizingExtractor
 from sb3_progpolicy.policies import ProgrammaticActorCritic, ProgrammaticPolicy, RecurrentProgrammaticPolicy
-from sb3_progpolicy.programs.program import Program
+from sb3_progpolicy.programs.program import LEARNED_BY, Program
 from sb3_progpolicy.reptile.callback import check_reptile_arguments, start_task
 from sb3_progpolicy.reptile.checks import check_variations
 from sb3_progpolicy.reptile.statistics import EpisodeStatistics
 from sb3_progpolicy.reptile.steps import MetaOptimizer, MetaOptimizerName, Task, begin_task
 from sb3_progpolicy.reptile.tasks import TaskDistribution, default_tasks
 from sb3_progpolicy.reptile_ppo.environments import make_venv, symmetries_of, with_history
+from sb3_progpolicy.reptile_ppo.initial import initial_policy_kwargs, read_initial_program, start_from_program
 from sb3_progpolicy.reptile_ppo.inner_loops import (
     EngineName,
     InnerLoops,
     check_batch_arguments,
-    mean_of,
+    inner_updates_of_batch,
     open_inner_loops,
 )
 from sb3_progpolicy.reptile_ppo.sequence_ppo import default_batch_size
@@ -102,6 +104,9 @@ class ReptilePPO(StoredPPO):
         environment id
     :param meta_update: ``False`` for PPO-N: tasks change, the meta-step is left out
     :param search_fraction: share of the steps, 0 to 1, after which the program is extracted
+    :param init_program: start from this program, without a search: a ``Program``, its ``.json`` file, a run folder or
+        the name of a shipped one. Soft and crisp program are equal then but close to where a condition changes, and Box
+        actions have a deviation of a tenth of half their range, unless ``temperature`` and ``action_std`` say otherwise
     :param length_coef: price on the expected number of conditions, at least 0; the higher, the shorter the programs
     :param temperature: of the sigmoid in the soft semantics, a number or a schedule of the remaining progress; ``None``
         leaves it as the policy has it
@@ -161,6 +166,7 @@ class ReptilePPO(StoredPPO):
         engine: EngineName = "local",
         meta_update: bool = True,
         search_fraction: float = 0.5,
+        init_program: Program | str | os.PathLike[str] | None = None,
         length_coef: float = 0.005,
         temperature: float | Schedule | None = None,
         action_temperature: float | Schedule | None = None,
@@ -201,13 +207,17 @@ class ReptilePPO(StoredPPO):
         if learning_rate is None:
             learning_rate = 2e-2 if learns_program else 3e-4
         if normalize_observations is None:
-            normalize_observations = learns_program
+            normalize_observations = learns_program and init_program is None
         policy_kwargs = dict(policy_kwargs or {})
         self.symmetric = symmetric
         if symmetric and "symmetries" not in policy_kwargs:
             policy_kwargs["symmetries"] = symmetries_of(self.env_id, venv)
         if normalize_observations:
             policy_kwargs.setdefault("features_extractor_class", NormalizingExtractor)
+        initial = read_initial_program(init_program)
+        if initial is not None:
+            policy_kwargs = initial_policy_kwargs(initial, policy_class, policy_kwargs)
+        self._initial_program, self.learned_by = initial, LEARNED_BY[0]
         self.inner_updates, self.tasks_per_iteration = inner_updates, tasks_per_iteration
         self.meta_learning_rate = meta_learning_rate
         self.meta_optimizer, self.meta_update = meta_optimizer, meta_update
@@ -252,6 +262,9 @@ class ReptilePPO(StoredPPO):
 
     def _setup_model(self) -> None:
         super()._setup_model()  # lines 1-2: the derivation graph, its W at even odds, and phi
+        if self._initial_program is not None:
+            self.learned_by = start_from_program(self, self._initial_program)
+            self._initial_program = None
         self._statistics: EpisodeStatistics | None = None
         self.outer_optimizer = MetaOptimizer(self.meta_optimizer)
 
@@ -293,7 +306,7 @@ class ReptilePPO(StoredPPO):
             theta, task, rng = self._begin_task()  # lines 4 and 12
             self._inner_updates(task, rng, learning)  # theta becomes theta_hat: lines 5-7 and 13-15
         else:
-            theta = self._inner_updates_of_batch(learning)
+            theta = inner_updates_of_batch(self, learning)
         self.meta_iteration += 1
         self.logger.record("reptile/meta_iteration", self.meta_iteration)
         if self.meta_update:
@@ -315,25 +328,6 @@ class ReptilePPO(StoredPPO):
             rng=self.rng,
             replica=replica,
         )
-
-    def _inner_updates_of_batch(self, learning: _Learning) -> list[th.Tensor]:
-        """Let several inner loops start from theta and take over the mean of their results; return theta."""
-        learning.callback.on_rollout_start()
-        assert learning.inner_loops is not None
-        begun = [self._begin_task(replica) for replica in range(self.meta_batch_size)]
-        theta = Theta.of(self)
-        results = learning.inner_loops.run(theta, [(task, rng) for _, task, rng in begun])
-        mean_of(results, theta).put_into(self)
-        for _ in range((self.num_timesteps - theta.num_timesteps) // self.n_envs):
-            if not learning.callback.on_step():
-                learning.stopped = True
-                break
-        learning.callback.on_rollout_end()
-        before, learning.n_rollouts = learning.n_rollouts, learning.n_rollouts + len(begun) * self.inner_updates
-        interval = learning.log_interval
-        if interval is not None and learning.n_rollouts // interval > before // interval:
-            self.dump_logs(learning.n_rollouts)
-        return begun[0][0]
 
     def inner_loop(self, theta: Theta, task: Task, rng: np.random.Generator) -> Theta:
         """Make the inner updates of one task: ``theta`` becomes ``theta_hat`` (lines 5-7).

@@ -304,3 +304,27 @@ def _mean(states: Sequence[dict[str, Any]], last: dict[str, Any]) -> dict[str, A
         real = isinstance(value, th.Tensor) and value.is_floating_point()
         mean[name] = th.stack([state[name] for state in states]).mean(0) if real else value
     return mean
+
+
+def inner_updates_of_batch(model: Any, learning: Any) -> list[th.Tensor]:
+    """Let several inner loops start from theta and take over the mean of their results; return theta.
+
+    :param model: a ReptilePPO
+    :param learning: what its ``learn`` keeps
+    """
+    learning.callback.on_rollout_start()
+    assert learning.inner_loops is not None
+    begun = [model._begin_task(replica) for replica in range(model.meta_batch_size)]
+    theta = Theta.of(model)
+    results = learning.inner_loops.run(theta, [(task, rng) for _, task, rng in begun])
+    mean_of(results, theta).put_into(model)
+    for _ in range((model.num_timesteps - theta.num_timesteps) // model.n_envs):
+        if not learning.callback.on_step():
+            learning.stopped = True
+            break
+    learning.callback.on_rollout_end()
+    before, learning.n_rollouts = learning.n_rollouts, learning.n_rollouts + len(begun) * model.inner_updates
+    interval = learning.log_interval
+    if interval is not None and learning.n_rollouts // interval > before // interval:
+        model.dump_logs(learning.n_rollouts)
+    return begun[0][0]

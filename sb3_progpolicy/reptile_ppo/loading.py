@@ -177,6 +177,7 @@ def _tasks(data: Mapping[str, Any]) -> TaskDistribution:
 
 def _restore_state(model: ReptilePPO, state: Mapping[str, Any]) -> None:
     model.wrappers = tuple(state.get("wrappers", ()))
+    model.learned_by = state.get("learned_by", model.learned_by)
     model.input_names, model.output_names = (
         names and tuple(names) for names in (state.get("input_names"), state.get("output_names"))
     )

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule, get_system_info
 
 from sb3_progpolicy.programs.files import write_atomically
+from sb3_progpolicy.programs.program import LEARNED_BY
 from sb3_progpolicy.reptile.tasks import SAMPLERS, TaskDistribution
 from sb3_progpolicy.reptile_ppo.values import ModelFormatError, NotDataError, from_data, to_data
 
@@ -123,6 +124,7 @@ STATE: Mapping[str, Check] = {
     "input_names": _optional(_all(_text)),
     "output_names": _optional(_all(_text)),
     "wrappers": _all(_text),
+    "learned_by": lambda value: value in LEARNED_BY,
     "num_timesteps": _count,
     "total_timesteps": _count,
     "progress_remaining": _number,
@@ -249,6 +251,7 @@ def _state(model: Any) -> dict[str, Any]:
         "input_names": model.input_names,
         "output_names": model.output_names,
         "wrappers": model.wrappers,
+        "learned_by": model.learned_by,
         "num_timesteps": model.num_timesteps,
         "total_timesteps": model._total_timesteps,
         "progress_remaining": model._current_progress_remaining,

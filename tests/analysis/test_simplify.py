@@ -11,7 +11,8 @@ from progpolicy_envs import DOMAINS
 from progpolicy_envs.symmetry import group_of
 from sb3_progpolicy import load_pretrained
 from sb3_progpolicy.analysis.integer import fewest_terms
-from sb3_progpolicy.analysis.simplify import count_numbers, simplify
+from sb3_progpolicy.analysis.rules import count_numbers
+from sb3_progpolicy.analysis.simplify import simplify
 from sb3_progpolicy.analysis.situations import good_actions, meet
 from sb3_progpolicy.analysis.terms import terms_of
 from sb3_progpolicy.analysis.verify import verify
@@ -148,7 +149,9 @@ def test_branches_keep_their_numbers_where_an_earlier_one_is_dropped():
 
 def test_recurrent_conditions_stay_and_it_is_said(hanoi):
     program = hanoi.program
-    cell = Condition("rnn", ((0.1,) * 17,), ((0.5,),), (0.0,), (0.0,), (1.0,), -9.0)
+    # A memory of two units, which turns on and off in turns.
+    turns = ((-3.0, 0.0), (0.0, 0.0))
+    cell = Condition("rnn", ((0.0,) * 17,) * 2, turns, (1.0, 0.0), (0.0, 0.0), (1.0, 0.0), 0.0)
     recurrent = dataclasses.replace(program, body=IfThenElse(cell, program.controllers[0], program.controllers[0]))
     found = simplify(recurrent)
     assert found.program.conditions == (cell,)
@@ -166,7 +169,7 @@ def test_where_no_tied_rule_is_found_an_untied_one_is_and_it_is_said():
 
 
 def test_where_no_rule_is_found_the_original_stays_and_it_is_said(monkeypatch):
-    monkeypatch.setattr("sb3_progpolicy.analysis.simplify.fewest_terms", lambda *arguments, **options: None)
+    monkeypatch.setattr("sb3_progpolicy.analysis.rules.fewest_terms", lambda *arguments, **options: None)
     program = load_pretrained("Hanoi-v0")
     found = simplify(program)
     assert found.program == program, "nothing says that it was simplified"

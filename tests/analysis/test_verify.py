@@ -103,12 +103,60 @@ def test_certificate_names_program_versions_and_command(small, tmp_path, capsys)
     assert len(written["rows"]) == 2
     assert len(written["program"]) == 16
     assert "every start" in capsys.readouterr().out
+    assert [file.name for file in tmp_path.iterdir()] == ["certificate.json"], "its state is removed"
 
 
 def test_digest_tells_programs_apart_and_looks_away_from_metadata():
     programs = [load_pretrained(name) for name in ("Hanoi-v0", "Stacking-v0")]
     assert len({program_digest(program) for program in programs}) == 2
     assert program_digest(dataclasses.replace(programs[0], metadata={"a": 1})) == program_digest(programs[0])
+
+
+@pytest.mark.parametrize("n_batches", [1, 3, 6])
+def test_interrupted_verification_goes_on_to_the_same_rows(n_batches, tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_progpolicy.analysis.verify.BATCH", 64)
+    monkeypatch.setattr("sb3_progpolicy.analysis.checkpoint.INTERVAL", 0.0)
+    program, path = load_pretrained("Hanoi-v0"), tmp_path / "state.json"
+    arguments = {"variations": [{"n_discs": 2}, {"n_discs": 4}], "from_any_state": True, "max_steps": 20}
+    whole = verify(program, **arguments)
+    assert 0 < whole[1].solved < whole[1].starts == 486
+    made = []
+
+    def interrupt(done, total):
+        made.append(done)
+        if len(made) == n_batches:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        verify(program, **arguments, progress=interrupt, checkpoint=path)
+    assert verify(program, **arguments, progress=interrupt, checkpoint=path) == whole
+    assert made == [54, *range(64, 486, 64), 486], "no batch is made twice"
+    assert verify(program, **arguments, progress=interrupt, checkpoint=path) == whole
+    assert made[-1] == 486, "all of it was done already"
+    assert len(made) == 9
+
+
+def test_state_of_another_verification_is_refused(tmp_path):
+    program, path = load_pretrained("Hanoi-v0"), tmp_path / "state.json"
+    verify(program, variations=[{"n_discs": 1}], checkpoint=path)
+    with pytest.raises(ValueError, match="another variations; give the same arguments"):
+        verify(program, variations=[{"n_discs": 2}], checkpoint=path)
+    path.write_text("{}")
+    with pytest.raises(ValueError, match=r"not the state of a verification.*remove it"):
+        verify(program, variations=[{"n_discs": 1}], checkpoint=path)
+
+
+def test_drawn_starts_are_the_same_after_an_interruption(tmp_path, monkeypatch):
+    program, path = load_pretrained("Stacking-v0"), tmp_path / "state.json"
+    arguments = {"variations": [{"n_plates": 3}, {"n_plates": 2}], "n_starts": 40, "seed": 4}
+    whole = verify(program, **arguments)
+
+    def interrupt(done, total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        verify(program, **arguments, progress=interrupt, checkpoint=path)
+    assert verify(program, **arguments, checkpoint=path) == whole
 
 
 @pytest.mark.parametrize(("arguments", "message"), [

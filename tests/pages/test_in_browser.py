@@ -1,21 +1,30 @@
 """Pages in headless Chromium: no error, no request, and keys and clicks do what they say."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sb3_progpolicy import load_pretrained, pretrained_names
 from sb3_progpolicy.pages import export_html
+from sb3_progpolicy.programs import load_program
+from tests.analysis import maze
 from tests.handwritten.hiking import egocentric_program, map_program
 from tests.pages.chromium import chromium
 from tests.programs.hostile import with_hostile_texts
 from tests.programs.strategies import build_program, hanoi_program, small_program
+from tests.programs.test_grids import OTHER
+from tests.programs.test_grids import program as on_a_grid
 
+SMALL_STACKING = Path(__file__).parents[2] / "benchmarks" / "results" / "simplified" / "Stacking-v0.json"
 PAGES = {
     **{name: lambda name=name: load_pretrained(name) for name in pretrained_names()},
     "Hiking-v0": map_program,
     "HikingEgo-v0": egocentric_program,
+    "small Stacking-v0": lambda: load_program(SMALL_STACKING),
+    "table": lambda: on_a_grid(OTHER, -3.0, 1.5),
+    "switch": lambda: maze.program(maze.SWITCH),
     "recurrent": lambda: hanoi_program(3, "gru"),
     "unknown": lambda: build_program(5, ["lstm", "affine"], "multi_discrete", True),
 }
@@ -219,6 +228,31 @@ def test_a_page_of_mostly_zero_weights_shows_the_others_only(visit, tab):
     visit(replace(program, body=body))
     assert tab.evaluate("document.querySelectorAll('.leaf .term').length") == np.count_nonzero(weights)
     assert tab.evaluate("document.querySelector('#tree button')") is None
+
+
+SHOWN = "[...document.querySelectorAll('SELECTOR')].map((element) => element.textContent.replace(/\\s+/g, ' ').trim())"
+
+
+def test_weights_on_a_grid_are_shown_as_a_function_or_as_a_table(visit, tab):
+    visit(load_program(SMALL_STACKING))
+    assert tab.evaluate(SHOWN.replace("SELECTOR", ".leaf dd"))[:2] == [
+        "table \u00d7 (4 \u2212 2 row) + 4 gripper[row]",
+        "table \u00d7 (\u22124 + 2 column) \u2212 4 gripper[column]",
+    ]
+    assert tab.evaluate("document.querySelector('#tree button')") is None, "nothing is left out"
+    visit(on_a_grid(OTHER, -3.0, 1.5))
+    assert tab.evaluate(SHOWN.replace("SELECTOR", ".leaf td")) == ["1", "2", "3", "1", "2", "\u221240"]
+    assert tab.evaluate(SHOWN.replace("SELECTOR", ".leaf caption")) == ["table \u00d7"]
+
+
+def test_a_switch_is_shown_as_what_turns_it_on_and_off(visit, tab):
+    program = maze.program(maze.SWITCH)
+    visit(program)
+    assert tab.evaluate(SHOWN.replace("SELECTOR", ".test .sum")) == [
+        "B1 = 0.50 while on, \u22120.50 while off",
+        "on when \u22121 + 1 cue_right \u2265 0",
+        "off when \u22121 + 1 cue_left \u2265 0",
+    ]
 
 
 def test_hostile_names_are_shown_as_they_are(visit, tab):

@@ -218,13 +218,13 @@ def test_text_of_a_small_program_reads_like_this():
         "Each line gives the score of one action; the action with the highest score is taken.\n"
         "\n"
         "always:\n"
-        "    left = 0.50 - 2.50*speed + 1.00*[cart position] + (1 smaller term)\n"
-        "    stay = -1.00\n"
+        "    left = 0.50 - 2.50*speed + [cart position] + (1 smaller term)\n"
+        "    stay = -1\n"
     )
     assert str(program) == export_text(program)
 
 
-def test_whole_numbers_are_printed_without_a_point_where_all_are_whole():
+def test_whole_numbers_are_printed_without_a_point():
     assert export_text(program_by_hand()).partition("\n\n")[2] == (
         "if B1 >= 0:\n"
         "    left  = 0\n"
@@ -239,15 +239,26 @@ def test_whole_numbers_are_printed_without_a_point_where_all_are_whole():
     )
     assert "left = 0  -5 previous left  -angle[0]\\l" in export_graphviz(program_by_hand())
     assert "0 & -1 & 0 & 0 & -5 & 0" in export_latex(program_by_hand())
-    assert "    left  = -5.00*[previous left] - 0.50*angle[0]\n" in export_text(program_by_hand(-0.5))
-    assert "3.00*angle[0]" in export_text(program_by_hand(-0.5))
+
+
+def test_whole_numbers_keep_their_form_beside_others_and_what_only_rounds_to_one_has_a_point():
+    for weight, printed in ((-0.5, "0.50*"), (-2.999, "3.00*"), (-3.0, "3*"), (-1.001, "1.00*"), (-1.0, "")):
+        text = export_text(program_by_hand(weight))
+        assert f"    left  = -5*[previous left] - {printed}angle[0]\n" in text
+        assert "    right = -1 + 3*angle[0]\n" in text
+    assert "0 & -0.50 & 0 & 0 & -5 & 0" in export_latex(program_by_hand(-0.5))
+    assert "left = 0  -5 previous left  -0.50 angle[0]\\l" in export_graphviz(program_by_hand(-0.5))
+    axes = plot_program(program_by_hand(-0.5), decimals=2)
+    texts = {text.get_text() for text in axes.texts}
+    matplotlib.pyplot.close(axes.figure)
+    assert {"\N{MINUS SIGN}0.50 angle[0]", "\N{MINUS SIGN}5 previous left", "+3 angle[0]"} <= texts
 
 
 def test_every_print_counts_what_it_leaves_out_or_shows_that_it_is_there():
     program = program_by_hand(-0.001)
-    assert "left  = -5.00*[previous left] + (1 smaller term)" in export_text(program)
-    assert "left = 0  -5.00 previous left  (1 smaller term)" in export_graphviz(program)
-    assert "0 & 0.00 & 0 & 0 & -5.00" in export_latex(program)
+    assert "left  = -5*[previous left] + (1 smaller term)" in export_text(program)
+    assert "left = 0  -5 previous left  (1 smaller term)" in export_graphviz(program)
+    assert "0 & 0.00 & 0 & 0 & -5" in export_latex(program)
     axes = plot_program(program)
     assert "… 1" in [text.get_text() for text in axes.texts]
     matplotlib.pyplot.close(axes.figure)
@@ -284,7 +295,9 @@ def test_text_gives_every_number_of_a_condition_when_asked(cell):
     text = export_text(program, decimals=3, max_terms=None).replace(" ", "").replace("\n", "")
     weights = [weight for row in (*test.weight_ih, *test.weight_hh, test.readout) for weight in row]
     for weight in weights:
-        if round(weight, 3):
+        if weight == int(weight):
+            assert abs(weight) <= 1 or f"{abs(int(weight))}*" in text
+        elif round(weight, 3):
             assert f"{abs(weight):.3f}*" in text
 
 
@@ -351,7 +364,7 @@ def test_latex_gives_every_matrix():
     program = hanoi_program()
     source = export_latex(program, decimals=3)
     for controller in program.controllers:
-        assert " & ".join(f"{w:.3f}" if round(w, 3) else "0" for w in controller.weights[0]) in source
+        assert " & ".join(str(int(w)) if w == int(w) else f"{w:.3f}" for w in controller.weights[0]) in source
     assert source.count(r"\otimes") == 0
     assert r"\text{move 0-\textgreater{}1}" in source
 

@@ -94,7 +94,7 @@ def check_actions(program, folder, n_steps, seed=0, **options):
 @pytest.mark.parametrize("kind", KINDS)
 def test_header_takes_the_same_actions_as_the_runner(kind, interaction, tmp_path):
     branches = set()
-    for seed in range(3):
+    for seed in range(len(CELLS)):
         program = build_program(seed, [*CELLS[seed:], *CELLS[:seed]], kind, interaction, hidden_size=seed + 1)
         branches |= check_actions(program, tmp_path, 1_000, seed)
     assert len(branches) > 3

@@ -83,7 +83,8 @@ def test_where_the_batch_size_does_not_divide_the_rollout_sequences_are_shorter_
 
 @pytest.mark.parametrize("cell", ["gru", "lstm", "rnn"])
 def test_rollout_of_the_sampler_is_that_of_the_policy_stepped_by_hand(cell):
-    model = make(policy_kwargs={"cell": cell}, inner_updates=1, n_epochs=1, learning_rate=0.0)
+    kwargs = {"inner_updates": 1, "n_epochs": 1, "learning_rate": 0.0, "normalize_observations": False}
+    model = make(policy_kwargs={"cell": cell}, **kwargs)
     model.learn(64)
     buffer, state = model.rollout_buffer, model.policy.module.initial_state(4)
     observations = th.as_tensor(buffer.observations.reshape(16, 4, -1))

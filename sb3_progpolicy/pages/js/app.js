@@ -17,7 +17,7 @@ class Page {
     this.program = this.policy.program;
     this.place = Object.fromEntries(PLACES.map((id) => [id, document.getElementById(id)]));
     this.selected = null;
-    this.tree = new ProgramView(this.place.tree, this.program, data.importance);
+    this.tree = new ProgramView(this.place.tree, this.program, data.importance, data.grids);
     this.reasons = new ReasonsView(this.place.reasons, this.policy);
     this.charts = new ChartsView(this.place.timeline, this.place.charts, this.program, (t) => this.seek(t));
     this.inputs = new InputsView(this.place.inputs, this.place["more-inputs"], this.program.inputNames);

@@ -37,6 +37,7 @@ _STEPS: dict[Cell, tuple[str, ...]] = {
         "c[k] = f[k] * c[k] + i[k] * tanh(g[k]);",
         "h[k] = o[k] * tanh(c[k]);",
     ),
+    "switch": ("if (on[k] >= 0.0) h[k] = 1.0;", "else if (off[k] >= 0.0) h[k] = 0.0;"),
 }
 
 
@@ -172,7 +173,7 @@ class _CPrinter(ProgramVisitor[list[str]]):
             f"double y[{n_outputs}];",
             *self._read_history(),
             # A program need not read all that it is given.
-            f"(void)state, (void)x, (void)previous_action, (void)reward, (void)done{', (void)p' * history};",
+            f"(void)state, (void)x, (void)y, (void)previous_action, (void)reward, (void)done{', (void)p' * history};",
         ]
         for index, condition in enumerate(self.program.conditions, start=1):
             body += ["", f"/* Condition {index}: {_condition_words(condition)} */", *self._condition(condition, index)]

@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
-from sb3_progpolicy.programs.export.grids import MaxTerms, blocks_of, collapse, terms_to_show
+from sb3_progpolicy.programs.export.grids import MaxTerms, Tables, beginnings, blocks_of, collapse, terms_to_show
 from sb3_progpolicy.programs.export.visitor import (
     CELL_NAMES,
     Decimals,
@@ -14,7 +14,9 @@ from sb3_progpolicy.programs.export.visitor import (
     counted,
     deliver,
     input_importance,
+    is_switch,
     largest_terms,
+    switch_sums,
     title,
 )
 from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, ProgramData
@@ -54,8 +56,9 @@ def export_graphviz(
 class _DotPrinter(ProgramVisitor[list[str]]):
     def __init__(self, program: ProgramData, decimals: int, max_terms: MaxTerms) -> None:
         super().__init__(program)
-        self.number = Decimals(program, decimals)
+        self.number = Decimals(decimals)
         self.max_terms, self.blocks = terms_to_show(program, max_terms), blocks_of(program)
+        self.tables = Tables()
 
     def visit_branch(self, branch: IfThenElse, index: int) -> list[str]:
         following = f"B{index + 2}" if isinstance(branch.orelse, IfThenElse) else f"C{index + 2}"
@@ -69,11 +72,12 @@ class _DotPrinter(ProgramVisitor[list[str]]):
 
     def visit_controller(self, controller: Controller, index: int) -> list[str]:
         lines = [
-            f"{name} = {self._sum(constant, *collapse(self.blocks, weights, self.program.input_names))}"
+            f"{name} = {self._inputs_sum(constant, weights)}"
             for name, constant, weights in zip(
                 self.program.output_names, controller.bias, controller.weights, strict=True
             )
         ]
+        lines += map(_apart, self.tables.new_lines())
         # \l ends a line that is set flush left.
         return [f'  C{index + 1} [fillcolor="#e3f0f7", label={_quote(*lines, end="l")}];']
 
@@ -81,7 +85,16 @@ class _DotPrinter(ProgramVisitor[list[str]]):
         if condition.cell == "affine":
             return [
                 f"B{index + 1} >= 0 ?",
-                self._sum(condition.readout_bias, *collapse(self.blocks, condition.readout, self.program.input_names)),
+                self._inputs_sum(condition.readout_bias, condition.readout),
+                *map(_apart, self.tables.new_lines()),
+            ]
+        if is_switch(condition):
+            while_on, while_off = condition.readout_bias + condition.readout[0], condition.readout_bias
+            return [
+                f"B{index + 1} >= 0 ?",
+                f"B{index + 1} = {self.number(while_on)} while on, {self.number(while_off)} while off",
+                *(f"{name} when  {self._inputs_sum(*of_x)}  >= 0" for name, of_x in switch_sums(condition)),
+                *map(_apart, self.tables.new_lines()),
             ]
         units = [f"h{unit + 1}" for unit in range(condition.hidden_size)]
         heard = largest_terms(input_importance(condition), self.program.input_names, 9, self.max_terms)
@@ -92,14 +105,22 @@ class _DotPrinter(ProgramVisitor[list[str]]):
             f"listens most to {', '.join(name for _, name in heard.shown) or 'nothing'}",
         ]
 
+    def _inputs_sum(self, constant: float, weights: Sequence[float]) -> str:
+        return self._sum(constant, *collapse(self.blocks, weights, self.program.input_names, self.tables))
+
     def _sum(self, constant: float, weights: Sequence[float], names: Sequence[str]) -> str:
-        terms = largest_terms(weights, names, self.number.digits, self.max_terms)
+        terms = largest_terms(weights, names, self.number.digits, self.max_terms, beginnings(self.blocks))
         tokens = [
             self.number(constant),
             *(f"{'-' if weight < 0 else '+'}{self.number.factor(weight, ' ')}{name}" for weight, name in terms.shown),
             *([f"({counted(terms.n_dropped, 'smaller term')})"] if terms.n_dropped else []),
         ]
         return "  ".join(tokens)
+
+
+def _apart(line: str) -> str:
+    """A row of a table, with spaces that Graphviz keeps."""
+    return line.replace(" ", "\N{NO-BREAK SPACE}")
 
 
 def _quote(*lines: str, end: str = "n") -> str:

@@ -1,4 +1,4 @@
-"""Blocks of inputs that lie on a grid, printed as the function of row and column that their weights are."""
+"""Blocks of inputs that lie on a grid, printed as a function of row and column, or as a table of whole numbers."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ import numpy as np
 
 from sb3_progpolicy.programs.syntax import ProgramData
 
-#: Said where a function of row and column is printed.
 #: A picture shows sums of up to so many terms in full, and of larger ones so many.
 FEW_TERMS, MOST_TERMS = 6, 3
 MaxTerms = int | None | Literal["auto"]
+#: A table has so many numbers that are not zero, and so many in all, columns and digits.
+MIN_NUMBERS, MAX_NUMBERS, MAX_COLUMNS, MAX_SIZE = 4, 120, 12, 9999
+Table = tuple[tuple[int, ...], ...]
+#: Said where a function of row and column, or a table, is printed.
 LEGEND = "{name}*(...) is summed over all cells {name}[row,column]; rows and columns count from 0."
 
 
@@ -73,6 +76,58 @@ def as_function(block: Block, weights: Sequence[float]) -> tuple[float, float, f
     return (a, b, c) if whole and np.array_equal(a + b * rows + c * columns, given) else None
 
 
+def as_table(block: Block, weights: Sequence[float]) -> Table | None:
+    """Return the weights of a grid in its shape, if they are whole numbers, several and not too many; else ``None``.
+
+    :param block: the grid
+    :param weights: of all inputs
+    """
+    given = weights[block.start : block.stop]
+    if len(given) > MAX_NUMBERS or block.columns > MAX_COLUMNS or sum(map(bool, given)) < MIN_NUMBERS:
+        return None
+    if any(number != round(number) or abs(number) > MAX_SIZE for number in given):
+        return None
+    numbers = [int(number) for number in given]
+    return tuple(tuple(numbers[row * block.columns :][: block.columns]) for row in range(block.rows))
+
+
+class Tables:
+    """The tables of a print, named T1, T2 ... in the order in which they are met; equal ones have one name."""
+
+    def __init__(self) -> None:
+        self._names: dict[Table, str] = {}
+        self._n_shown = 0
+
+    def name(self, table: Table) -> str:
+        """Return the name of a table."""
+        return self._names.setdefault(table, f"T{len(self._names) + 1}")
+
+    def new_lines(self) -> list[str]:
+        """Return the lines of the tables that were named since the last time."""
+        lines: list[str] = []
+        for table, name in list(self._names.items())[self._n_shown :]:
+            width = max(len(str(number)) for row in table for number in row)
+            rows = ["  ".join(str(number).rjust(width) for number in row) for row in table]
+            start = f"{name} = "
+            lines += [(start if not place else " " * len(start)) + row for place, row in enumerate(rows)]
+        self._n_shown = len(self._names)
+        return lines
+
+
+def block_text(block: Block, weights: Sequence[float], tables: Tables) -> str | None:
+    """Return how the weights of a grid are printed as one term; ``None`` if they are printed one by one, or zero.
+
+    :param block: the grid
+    :param weights: of all inputs
+    :param tables: of the print
+    """
+    function = as_function(block, weights)
+    if function is not None:
+        return function_text(block, function) if any(function) else None
+    table = as_table(block, weights)
+    return None if table is None else f"{block.name}*({tables.name(table)})"
+
+
 def function_text(block: Block, function: tuple[float, float, float]) -> str:
     """Return a function of row and column in words, such as ``table*(4 - 2*row)``.
 
@@ -88,20 +143,28 @@ def function_text(block: Block, function: tuple[float, float, float]) -> str:
     return f"{block.name}*({''.join(parts)})"
 
 
-def collapse(blocks: Sequence[Block], weights: Sequence[float], names: Sequence[str]) -> tuple[list[float], list[str]]:
-    """Return weights and names in which a grid that is a function of row and column is one term, of weight 1.
+def collapse(
+    blocks: Sequence[Block], weights: Sequence[float], names: Sequence[str], tables: Tables
+) -> tuple[list[float], list[str]]:
+    """Return weights and names in which a grid that is a function or a table is one term, of weight 1.
 
     :param blocks: of the program
     :param weights: of all inputs
     :param names: of all inputs
+    :param tables: of the print
     """
     left, named = list(weights), list(names)
     for block in reversed(blocks):
-        function = as_function(block, weights)
-        if function is not None and any(function):
+        text = block_text(block, weights, tables)
+        if text is not None:
             left[block.start : block.stop] = [1.0]
-            named[block.start : block.stop] = [function_text(block, function)]
+            named[block.start : block.stop] = [text]
     return left, named
+
+
+def beginnings(blocks: Sequence[Block]) -> tuple[str, ...]:
+    """Return with what the names begin that :func:`collapse` gives to grids."""
+    return tuple(f"{block.name}*(" for block in blocks)
 
 
 def terms_to_show(program: ProgramData, max_terms: MaxTerms) -> int | None:
@@ -115,5 +178,5 @@ def terms_to_show(program: ProgramData, max_terms: MaxTerms) -> int | None:
     blocks = blocks_of(program)
     rows = [row for controller in program.controllers for row in controller.weights]
     rows += [condition.readout for condition in program.conditions if condition.cell == "affine"]
-    counts = [sum(map(bool, collapse(blocks, row, program.input_names)[0])) for row in rows]
+    counts = [sum(map(bool, collapse(blocks, row, program.input_names, Tables())[0])) for row in rows]
     return None if max(counts, default=0) <= FEW_TERMS else MOST_TERMS

@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
+from sb3_progpolicy.programs.export.grids import as_function, as_table, blocks_of
 from sb3_progpolicy.programs.export.visitor import Decimals, ProgramVisitor, deliver
 from sb3_progpolicy.programs.syntax import GATES, Condition, Controller, IfThenElse, Matrix, ProgramData
 from sb3_progpolicy.spaces import ActionSpec
@@ -32,6 +33,11 @@ _CELLS = {
         r"n &= \tanh(W_n x + b_n + r \odot (U_n h_{%d} + d_n))",
         r"h_{%d} &\leftarrow (1 - z) \odot n + z \odot h_{%d}",
     ),
+    "switch": (
+        r"(p, q) &= W x + b + U h_{%d} + d",
+        r"h_{%d} &\leftarrow \begin{cases} 1 & \text{if } p \ge 0 \\ 0 & \text{else if } q \ge 0 \\"
+        r" h_{%d} & \text{otherwise} \end{cases}",
+    ),
     "lstm": (
         r"(i, f, o) &= \sigma(W_{i,f,o} x + b_{i,f,o} + U_{i,f,o} h_{%d} + d_{i,f,o})",
         r"g &= \tanh(W_g x + b_g + U_g h_{%d} + d_g)",
@@ -47,7 +53,8 @@ def export_latex(
     r"""Typeset a program: the case distinction, the conditions' recurrences and all matrices, in the paper's notation.
 
     The result is a fragment for a document that loads ``amsmath``. All weights are given, none is dropped: 0 is
-    zero, and 0.00 a number that rounds to it. No name becomes a command. A character beyond ASCII is printed as its
+    zero, and 0.00 a number that rounds to it. Whole numbers on a grid of the metadata that are no function of row and
+    column are given once more, in its shape. No name becomes a command. A character beyond ASCII is printed as its
     code, such as ``\u2192``, unless it is a letter of a Western European language.
 
     :param program: what to typeset
@@ -62,7 +69,7 @@ def export_latex(
 class _LatexPrinter(ProgramVisitor[list[str]]):
     def __init__(self, program: ProgramData, decimals: int) -> None:
         super().__init__(program)
-        self.number = Decimals(program, decimals)
+        self.number = Decimals(decimals)
 
     def print(self) -> str:
         program = self.program
@@ -82,8 +89,28 @@ class _LatexPrinter(ProgramVisitor[list[str]]):
         for index, controller in enumerate(program.controllers, start=1):
             constant = rf"c_{{{index}}} = {self._vector(controller.bias)}"
             blocks.append([r"\[", rf"{constant} \quad T_{{{index}}} = {self._matrix(controller.weights)}", r"\]"])
+        blocks += self._tables()
         body = "\n".join(line for block in blocks for line in block)
         return f"{{\\scriptsize\\setlength{{\\arraycolsep}}{{2pt}}\n{body}\n}}\n"
+
+    def _tables(self) -> list[list[str]]:
+        """Whole numbers on each grid in its shape, for every sum in which they are no function of row and column."""
+        program, found = self.program, []
+        sums = [
+            (rf"T_{{{index}}}, \text{{{_escape(name)}}}", row)
+            for index, controller in enumerate(program.controllers, start=1)
+            for name, row in zip(program.output_names, controller.weights, strict=True)
+        ]
+        for index, condition in enumerate(program.conditions, start=1):
+            rows = {"affine": (condition.readout,), "switch": condition.weight_ih}.get(condition.cell, ())
+            sums += [(f"B_{{{index}}}", row) for row in rows]
+        for block in blocks_of(program):
+            for where, weights in sums:
+                table = as_table(block, weights)
+                if table is not None and as_function(block, weights) is None:
+                    name = rf"\text{{{_escape(block.name)}}}"
+                    found.append([r"\[", rf"{where}, {name} = {self._matrix(table)}", r"\]"])
+        return found
 
     def visit_branch(self, branch: IfThenElse, index: int) -> list[str]:
         word = "else if" if index else "if"

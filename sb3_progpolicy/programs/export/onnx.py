@@ -113,6 +113,8 @@ class _Graph:
         n_gates = len(GATES[condition.cell])
         if condition.cell == "gru":
             self._gru(k, self._split(gates, n_gates, size), self._split(recurrent, n_gates, size), size)
+        elif condition.cell == "switch":
+            self._switch(k, self._split(self._node("Add", gates, recurrent), n_gates, size), size)
         elif condition.cell == "lstm":
             self._lstm(k, self._split(self._node("Add", gates, recurrent), n_gates, size), size)
         else:
@@ -130,6 +132,10 @@ class _Graph:
         written = self._node("Mul", i, self._node("Tanh", gates[2]))
         cell = self._output(f"c{k}_next", "Add", [self._node("Mul", f, f"c{k}"), written], np.float64, size)
         self._output(f"h{k}_next", "Mul", [o, self._node("Tanh", cell)], np.float64, size)
+
+    def _switch(self, k: int, gates: Sequence[str], size: int) -> None:
+        kept = self._node("Where", self._holds(gates[1]), self._constant(0.0), f"h{k}")
+        self._output(f"h{k}_next", "Where", [self._holds(gates[0]), self._constant(1.0), kept], np.float64, size)
 
     def _mixture_weights(self, values: Sequence[str]) -> str:
         """Crisp: 1 for the first condition that is not below 0. Soft: ``s_k * prod_{j<k}(1 - s_j)``."""

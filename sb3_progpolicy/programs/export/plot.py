@@ -6,14 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sb3_progpolicy.programs.export.grids import MaxTerms, blocks_of, collapse, terms_to_show
+from sb3_progpolicy.programs.export.grids import MaxTerms, Tables, beginnings, blocks_of, collapse, terms_to_show
 from sb3_progpolicy.programs.export.visitor import (
     CELL_NAMES,
     Decimals,
     ProgramVisitor,
     counted,
     input_importance,
+    is_switch,
     largest_terms,
+    switch_sums,
     title,
 )
 from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, ProgramData
@@ -121,8 +123,9 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
 
     def __init__(self, program: ProgramData, decimals: int, max_terms: MaxTerms, max_outputs: int) -> None:
         super().__init__(program)
-        self.number, self.max_outputs = Decimals(program, decimals), max_outputs
+        self.number, self.max_outputs = Decimals(decimals), max_outputs
         self.max_terms, self.blocks = terms_to_show(program, max_terms), blocks_of(program)
+        self.tables = Tables()
 
     def visit_branch(self, branch: IfThenElse, index: int) -> list[tuple[_Card | None, _Card]]:
         pair = (self._condition(branch.condition, index), self._leaf(branch.then))
@@ -133,8 +136,10 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
 
     def _condition(self, condition: Condition, index: int) -> _Card:
         inputs = self.program.input_names
+        if is_switch(condition):
+            return self._switch(condition, index)
         if condition.cell == "affine":
-            readout, names = collapse(self.blocks, condition.readout, inputs)
+            readout, names = self._collapsed(condition.readout)
             constant, terms = self._terms(condition.readout_bias, readout, names)
             lines = ["no memory"]
         else:
@@ -143,20 +148,22 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
             heard = largest_terms(input_importance(condition), inputs, 9, self.max_terms)
             lines = [f"memory h: {counted(condition.hidden_size, f'{CELL_NAMES[condition.cell]} unit')}"]
             lines += ["listens most to", *(f"  {_label(name)}" for _, name in heard.shown)] if heard.shown else []
-        number = index + 1
-        formula = [(f"B{number} = {constant}", INK, 0)]
-        for text, colour in terms:
-            formula.append((text, colour, formula[-1][2] + len(formula[-1][0]) + 1))
-        head = ((f"{'if' if not index else 'else if'} B{number} ≥ 0", INK, 0),)
-        return _Card((head, tuple(formula), *(((line, QUIET, 0),) for line in lines)))
+        formula = _in_a_row(f"B{index + 1} = {constant}", terms)
+        return _Card((_head(index), formula, *self._new_tables(), *(((line, QUIET, 0),) for line in lines)))
+
+    def _switch(self, condition: Condition, index: int) -> _Card:
+        while_on, while_off = condition.readout_bias + condition.readout[0], condition.readout_bias
+        values = f"B{index + 1} = {self.number(while_on)} while on, {self.number(while_off)} while off"
+        rows = []
+        for name, (constant, weights) in switch_sums(condition):
+            shown, terms = self._terms(constant, *self._collapsed(weights))
+            rows.append(_in_a_row(f"{name + ' when':<8} {shown}", [*terms, ("≥ 0", INK)]))
+        return _Card((_head(index), ((values.replace("-", MINUS), QUIET, 0),), *rows, *self._new_tables()))
 
     def _leaf(self, controller: Controller) -> _Card:
         names = [_label(name) for name in self.program.output_names]
         shown = min(len(names), self.max_outputs)
-        sums = [
-            self._terms(controller.bias[row], *collapse(self.blocks, controller.weights[row], self.program.input_names))
-            for row in range(shown)
-        ]
+        sums = [self._terms(controller.bias[row], *self._collapsed(controller.weights[row])) for row in range(shown)]
         columns = [max(len(name) for name in names[:shown]) + 2]
         columns.append(columns[0] + max(len(constant) for constant, _ in sums) + 2)
         for column in range(max(len(terms) for _, terms in sums)):
@@ -168,12 +175,18 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
             rows.append((*texts, *((text, colour, columns[k + 1]) for k, (text, colour) in enumerate(terms))))
         if shown < len(names):
             rows.append(((f"... and {len(names) - shown} more outputs", QUIET, 0),))
-        return _Card(tuple(rows))
+        return _Card((*rows, *self._new_tables()))
+
+    def _collapsed(self, weights: Sequence[float]) -> tuple[list[float], list[str]]:
+        return collapse(self.blocks, weights, self.program.input_names, self.tables)
+
+    def _new_tables(self) -> list[tuple[tuple[str, str, int], ...]]:
+        return [((line.replace("-", MINUS), QUIET, 0),) for line in self.tables.new_lines()]
 
     def _terms(
         self, constant: float, weights: Sequence[float], names: Sequence[str]
     ) -> tuple[str, list[tuple[str, str]]]:
-        terms = largest_terms(weights, names, self.number.digits, self.max_terms)
+        terms = largest_terms(weights, names, self.number.digits, self.max_terms, beginnings(self.blocks))
         shown = [
             (
                 f"{MINUS if weight < 0 else '+'}{self.number.factor(weight, ' ')}{_label(name)}",
@@ -183,6 +196,18 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
         ]
         left_out = [(f"… {terms.n_dropped}", QUIET)] if terms.n_dropped else []
         return self.number(constant).replace("-", MINUS), [*shown, *left_out]
+
+
+def _head(index: int) -> tuple[tuple[str, str, int], ...]:
+    return ((f"{'if' if not index else 'else if'} B{index + 1} ≥ 0", INK, 0),)
+
+
+def _in_a_row(start: str, terms: Sequence[tuple[str, str]]) -> tuple[tuple[str, str, int], ...]:
+    """A row of a card: texts one after the other."""
+    row = [(start, INK, 0)]
+    for text, colour in terms:
+        row.append((text, colour, row[-1][2] + len(row[-1][0]) + 1))
+    return tuple(row)
 
 
 def _label(name: str) -> str:

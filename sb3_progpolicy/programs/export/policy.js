@@ -88,6 +88,7 @@ class ProgramPolicy {
         const candidate = Math.tanh(sum(2, u) + sigmoid(sum(0, u)) * recurrent);
         return candidate + sigmoid(sum(1, u)) * (h - candidate);
       }
+      if (condition.cell === "switch") return sum(0, u) >= 0 ? 1 : sum(1, u) >= 0 ? 0 : h;
       const carried = sigmoid(sum(1, u)) * this.carried[index][u] + sigmoid(sum(0, u)) * Math.tanh(sum(2, u));
       this.carried[index][u] = carried;
       return sigmoid(sum(3, u)) * Math.tanh(carried);

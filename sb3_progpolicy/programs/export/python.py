@@ -119,7 +119,11 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
             "#     policy = ProgramPolicy()",
             "#     action = policy.act(observation, None, 0.0, False)      # the first step",
             "#     action = policy.act(observation, action, reward, done)  # every later step",
-            *(["", "from math import tanh"] if any(c.cell != "affine" for c in self.program.conditions) else []),
+            *(
+                ["", "from math import tanh"]
+                if any(c.cell not in ("affine", "switch") for c in self.program.conditions)
+                else []
+            ),
             "",
         ]
 

@@ -16,7 +16,7 @@ _MAX_IDENTIFIER = 40
 _TAKEN = {"self", "observation", "previous_action", "previous_reward", "previous_done", "reward", "done", "action"}
 _TAKEN |= {"scores", "tanh", "float", "int", "len", "max", "min", "map", *keyword.kwlist}
 # The local variables of the written method: one of these letters or words, then numbers.
-_OURS = re.compile(r"((new_)?[bhcrznifgoup]|scores|given|action)(_?[0-9])+")
+_OURS = re.compile(r"((new_)?[bhcrznifgoup]|on|off|scores|given|action)(_?[0-9])+")
 
 
 class Identifiers:
@@ -69,7 +69,7 @@ def _token(term: tuple[float, str]) -> str:
 
 
 def cell_statements(cell: str, unit: str) -> Iterator[str]:
-    """Update one unit of a GRU or an LSTM from its sums, by PyTorch's equations; an RNN's are updated together."""
+    """Update one unit of a GRU, an LSTM or a switch from its sums; those of an RNN are updated together."""
     if cell == "gru":
         yield f"r{unit} = 0.5 + 0.5 * tanh(0.5 * r{unit})"
         yield f"z{unit} = 0.5 + 0.5 * tanh(0.5 * z{unit})"
@@ -81,13 +81,19 @@ def cell_statements(cell: str, unit: str) -> Iterator[str]:
         yield f"o{unit} = 0.5 + 0.5 * tanh(0.5 * o{unit})"
         yield f"c{unit} = f{unit} * c{unit} + i{unit} * tanh(g{unit})"
         yield f"h{unit} = o{unit} * tanh(c{unit})"
+    elif cell == "switch":
+        yield f"h{unit} = 1.0 if on{unit} >= 0.0 else 0.0 if off{unit} >= 0.0 else h{unit}"
 
 
 def condition_words(condition: Condition) -> str:
     """What a condition remembers, for a comment."""
     if condition.cell == "affine":
         return "affine, no memory"
-    words = {"rnn": "h = tanh(...)", "gru": "reset r, update z, candidate n, memory h"}
+    words = {
+        "rnn": "h = tanh(...)",
+        "gru": "reset r, update z, candidate n, memory h",
+        "switch": "h is 1 once on >= 0, 0 once off >= 0",
+    }
     how = words.get(condition.cell, "input i, forget f, candidate g, output o, memory c and h")
     return f"{counted(condition.hidden_size, CELL_NAMES[condition.cell] + ' unit')}: {how}"
 

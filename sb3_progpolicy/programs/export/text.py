@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sb3_progpolicy.programs.export.grids import LEGEND, as_function, blocks_of, function_text
+from sb3_progpolicy.programs.export.grids import LEGEND, Tables, block_text, blocks_of
 from sb3_progpolicy.programs.export.visitor import (
     CELL_NAMES,
     Decimals,
@@ -12,9 +12,11 @@ from sb3_progpolicy.programs.export.visitor import (
     action_rule,
     counted,
     gate_names,
+    is_switch,
     largest_terms,
     pack,
     simplified_as,
+    switch_sums,
     title,
 )
 from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, ProgramData
@@ -26,6 +28,7 @@ _RULES = {
     "rnn": "RNN:  each step, h becomes the value of its line.",
     "gru": "GRU:  each step, h becomes (1 - z)*n + z*h, so z near 1 keeps the memory and z near 0 writes n.",
     "lstm": "LSTM: each step, c becomes f*c + i*g and h becomes o*tanh(c), so f keeps, i writes and o shows.",
+    "switch": "Switch: a step turns it on where its first line holds, off where only the second does; else it stays.",
 }
 
 
@@ -33,8 +36,8 @@ def export_text(program: ProgramData, decimals: int = 2, max_terms: int | None =
     """Print a program as an indented if-then-else that a person can read.
 
     The terms of every sum stand in order of size. Those that round to zero or come after ``max_terms`` are only
-    counted. If all weights and constants are whole, they are printed without a point. :func:`export_python` and the
-    saved file hold all numbers in full.
+    counted. Whole numbers are printed without a point, so that ``3`` is exact and ``3.00`` is rounded.
+    :func:`export_python` and the saved file hold all numbers in full.
 
     :param program: what to print
     :param decimals: digits after the point
@@ -48,8 +51,8 @@ def export_text(program: ProgramData, decimals: int = 2, max_terms: int | None =
 class _TextPrinter(ProgramVisitor[list[str]]):
     def __init__(self, program: ProgramData, decimals: int, max_terms: int | None) -> None:
         super().__init__(program)
-        self.number, self.max_terms = Decimals(program, decimals), max_terms
-        self.blocks = blocks_of(program)
+        self.number, self.max_terms = Decimals(decimals), max_terms
+        self.blocks, self.tables = blocks_of(program), Tables()
         self.inputs = [_set_apart(n) if _OPERATORS & set(n) or n[0].isdigit() else n for n in program.input_names]
 
     def print(self) -> str:
@@ -92,7 +95,9 @@ class _TextPrinter(ProgramVisitor[list[str]]):
 
     def _legend(self, printed: str) -> list[str]:
         used = [block.name for block in self.blocks if f"{block.name}*(" in printed]
-        return ["", *(LEGEND.format(name=name) for name in used)] if used else []
+        legend = ["", *(LEGEND.format(name=name) for name in used)] if used else []
+        tables = self.tables.new_lines()
+        return [*legend, *([""] if tables else []), *tables]
 
     def _lines(self, controller: Controller) -> list[str]:
         names = [_set_apart(name) if "=" in name else name for name in self.program.output_names]
@@ -103,21 +108,27 @@ class _TextPrinter(ProgramVisitor[list[str]]):
             lines += self._inputs_sum(start, constant, weights)
         return lines
 
-    def _inputs_sum(self, start: str, constant: float, weights: Sequence[float]) -> list[str]:
-        """A sum over X, its grids as functions of row and column where they are such."""
+    def _inputs_sum(self, start: str, constant: float, weights: Sequence[float], close: str = "") -> list[str]:
+        """A sum over X, its grids as functions of row and column or as tables where they are such."""
         left, functions = list(weights), []
         for block in self.blocks:
-            function = as_function(block, weights)
-            if function is not None and any(function):
-                functions.append(function_text(block, function))
+            text = block_text(block, weights, self.tables)
+            if text is not None:
+                functions.append(text)
                 left[block.start : block.stop] = [0.0] * (block.stop - block.start)
-        return self._sum(start, constant, left, self.inputs, functions=functions)
+        return self._sum(start, constant, left, self.inputs, close, functions)
 
     def _condition(self, condition: Condition, index: int) -> list[str]:
         size = condition.hidden_size
         start = f"B{index + 1} = "
         if condition.cell == "affine":
             return self._inputs_sum(start, condition.readout_bias, condition.readout)
+        if is_switch(condition):
+            while_on, while_off = condition.readout_bias + condition.readout[0], condition.readout_bias
+            lines = [f"{start}{self.number(while_on)} while on, {self.number(while_off)} while off"]
+            for name, (constant, weights) in switch_sums(condition):
+                lines += self._inputs_sum(f"{INDENT}{name + ' when':<9}", constant, weights, " >= 0")
+            return lines
         units = [f"h{unit + 1}" for unit in range(size)]
         lines = self._sum(start, condition.readout_bias, condition.readout, units)
         lines.append(f"{INDENT}its memory: {counted(size, f'{CELL_NAMES[condition.cell]} unit')}")
@@ -129,9 +140,13 @@ class _TextPrinter(ProgramVisitor[list[str]]):
     def _gates(self, condition: Condition, units: Sequence[str]) -> list[list[str]]:
         gates, names = [], [*self.inputs, *units]
         for row, (gate, unit) in enumerate(gate_names(condition)):
-            squash = "tanh" if gate in ("h", "n", "g") else "sigmoid"
+            squash = {"on": "", "off": ""}.get(gate, "tanh" if gate in ("h", "n", "g") else "sigmoid")
             recurrent, constant = condition.weight_hh[row], condition.bias_ih[row] + condition.bias_hh[row]
             label = f"{INDENT}h{unit + 1} = " if gate == "h" else f"{INDENT}{gate}{unit + 1} = "
+            if not squash:
+                label = f"{INDENT}h{unit + 1} {gate} when "
+                gates.append(self._sum(label, constant, (*condition.weight_ih[row], *recurrent), names, " >= 0"))
+                continue
             if gate != "n":
                 gates.append(
                     self._sum(f"{label}{squash}(", constant, (*condition.weight_ih[row], *recurrent), names, ")")

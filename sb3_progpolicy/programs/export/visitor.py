@@ -16,7 +16,7 @@ from sb3_progpolicy.spaces import ActionSpec
 
 Result = TypeVar("Result")
 
-CELL_NAMES = {"affine": "affine", "rnn": "RNN", "gru": "GRU", "lstm": "LSTM"}
+CELL_NAMES = {"affine": "affine", "rnn": "RNN", "gru": "GRU", "lstm": "LSTM", "switch": "switch"}
 
 
 class ProgramVisitor(ABC, Generic[Result]):
@@ -57,14 +57,19 @@ class Terms:
     n_dropped: int
 
 
-def largest_terms(weights: Sequence[float], names: Sequence[str], decimals: int, max_terms: int | None) -> Terms:
+def largest_terms(
+    weights: Sequence[float], names: Sequence[str], decimals: int, max_terms: int | None, first: tuple[str, ...] = ()
+) -> Terms:
     """Sort the terms of ``weights · names`` by size and drop those that round to zero.
 
     :param decimals: digits after the point
     :param max_terms: show no more than these; ``None`` for all
+    :param first: beginnings of names that stand before the others and are always shown
     """
     terms = sorted(((weight, name) for weight, name in zip(weights, names, strict=True) if weight), key=_by_size)
-    shown = [term for term in terms if round(term[0], decimals)][:max_terms]
+    ahead = [term for term in terms if first and term[1].startswith(first)]
+    others = [term for term in terms if term not in ahead and round(term[0], decimals)]
+    shown = [*ahead, *others[:max_terms]]
     return Terms(tuple(shown), len(terms) - len(shown))
 
 
@@ -73,39 +78,25 @@ def is_whole(value: float) -> bool:
     return math.isfinite(value) and abs(value) < 1e9 and value == int(value)
 
 
-def has_whole_numbers(program: ProgramData) -> bool:
-    """Whether all weights and constants of a program are whole, as those of one written by hand often are."""
-    return all(
-        is_whole(value)
-        for rows in (
-            *((*condition.weight_ih, *condition.weight_hh) for condition in program.conditions),
-            *((condition.bias_ih, condition.bias_hh, condition.readout) for condition in program.conditions),
-            *((*controller.weights, controller.bias) for controller in program.controllers),
-            [[condition.readout_bias for condition in program.conditions]],
-        )
-        for row in rows
-        for value in row
-    )
-
-
 class Decimals:
-    """Numbers as people read them: rounded, or without a point where all of the program's are whole.
+    """Numbers as people read them: whole ones without a point, all others rounded.
 
-    :param program: whose numbers are printed
-    :param decimals: digits after the point
+    :param digits: after the point
     """
 
-    def __init__(self, program: ProgramData, decimals: int) -> None:
-        self.digits = 0 if has_whole_numbers(program) else decimals
+    def __init__(self, digits: int) -> None:
+        self.digits = digits
 
     def __call__(self, value: float) -> str:
         """Print a number; one that is not zero but rounds to it is 0.00, and zero itself is 0."""
+        if is_whole(value):
+            return str(int(value))
         shown = round(value, self.digits) or 0.0  # no "-0.00"
-        return f"{shown:.{self.digits}f}" if value else "0"
+        return f"{shown:.{self.digits}f}"
 
     def factor(self, weight: float, between: str) -> str:
         """Print the size of a weight before a name, nothing for the whole number 1."""
-        return "" if self.digits == 0 and abs(weight) == 1 else f"{self(abs(weight))}{between}"
+        return "" if abs(weight) == 1 else f"{self(abs(weight))}{between}"
 
 
 def _by_size(term: tuple[float, str]) -> float:
@@ -123,6 +114,17 @@ def input_importance(condition: Condition) -> tuple[float, ...]:
         sum(abs(weight * condition.readout[row % size]) for row, weight in enumerate(column))
         for column in zip(*condition.weight_ih, strict=True)
     )
+
+
+def is_switch(condition: Condition) -> bool:
+    """Whether a condition is one switch that does not read itself, which is printed as what turns it on and off."""
+    return condition.cell == "switch" and condition.hidden_size == 1 and not any(map(any, condition.weight_hh))
+
+
+def switch_sums(condition: Condition) -> list[tuple[str, tuple[float, Sequence[float]]]]:
+    """What turns a switch on and off: ``"on"`` or ``"off"``, the constant and the weights of X of either sum."""
+    constants = [one + other for one, other in zip(condition.bias_ih, condition.bias_hh, strict=True)]
+    return list(zip(GATES["switch"], zip(constants, condition.weight_ih, strict=True), strict=True))
 
 
 def gate_names(condition: Condition) -> list[tuple[str, int]]:
