@@ -36,7 +36,8 @@ def extract_program(model: BaseAlgorithm, **metadata: Any) -> Program:
     """Return the most likely program of a model as plain data, its inputs and outputs named by the environment.
 
     It reads what the environment gives. What ``VecNormalize`` does to observations is folded into it, which is exact as
-    long as ``clip_obs`` is not reached. Other wrappers are named in ``metadata["wrappers"]``.
+    long as ``clip_obs`` is not reached. Other wrappers are named in ``metadata["wrappers"]``, and
+    the symmetry that ties the weights in ``metadata["symmetry"]``.
 
     :param model: of any algorithm, with the policy ``ProgPolicy`` or ``PRLPolicy``
     :param metadata: JSON values to keep with it; environment id, seed, number of steps and way of
@@ -56,6 +57,8 @@ def extract_program(model: BaseAlgorithm, **metadata: Any) -> Program:
         env_id, interaction, wrappers = env_id or env_id_of(env), appends_history(env), wrappers_of(env)
     origin = {"env": env_id, "seed": model.seed, "timesteps": model.num_timesteps}
     origin["learned_by"] = getattr(model, "learned_by", LEARNED_BY[0])
+    if policy.module.group is not None:
+        origin["symmetry"] = policy.module.group.members[0].name
     if wrappers:
         origin["wrappers"] = list(wrappers)
     # A saved model's tuples are loaded as lists.
