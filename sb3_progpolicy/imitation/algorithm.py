@@ -15,8 +15,8 @@ from sb3_progpolicy.imitation.augmentation import Augment, make_augmentation
 from sb3_progpolicy.imitation.conversion import rounded, to_program
 from sb3_progpolicy.imitation.decision_list import DecisionList
 from sb3_progpolicy.imitation.learner import Learner, Settings
-from sb3_progpolicy.imitation.rollouts import Collector, Episodes, Pool, Variations, play, program_act
-from sb3_progpolicy.imitation.saving import load_state, save_state
+from sb3_progpolicy.imitation.rollouts import Collector, Pool, Variations, play, program_act
+from sb3_progpolicy.imitation.saving import Scored, State, load_state, save_state
 from sb3_progpolicy.imitation.teachers import Teacher, TeacherLike, make_teacher
 from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.spaces import action_spec
@@ -116,15 +116,11 @@ def imitate(
             f"n_timesteps={n_timesteps}, max_conditions={max_conditions}, n_episodes={n_episodes} are not accepted; "
             f"at least {n_shares * n_envs} (for n_envs={n_envs}), 0 and 1 are"
         )
-    pool = Pool(env_id, n_envs, env_kwargs, interaction)
-    try:
+    with Pool(env_id, n_envs, env_kwargs, interaction) as pool:
         run = _Run(pool, teacher, env_id, tasks, seed, max_conditions + 1, ignore, n_episodes, score_tolerance, augment)
-        return run.run(n_timesteps // (n_shares * n_envs), callback, checkpoint)
-    finally:
-        pool.close()
-
-
-Scored = tuple[float, DecisionList]
+        n_states = n_timesteps // n_shares
+        with Pool(env_id, run.n_rows(n_states), env_kwargs, interaction) as visited:
+            return run.run(visited, n_states, callback, checkpoint)
 
 
 class _Run:
@@ -155,8 +151,7 @@ class _Run:
         # The smaller sizes are the ends of the larger ones, which therefore say more.
         ranked = list(zip(self.variations, ranks, strict=True))
         self.validation = [one for least in (largest - 1, largest) for one, rank in ranked if rank >= least]
-        augmentation = make_augmentation(augment, self.inputs)
-        self.collector = Collector(pool, self.teacher, self.variations, ranks, seed, augmentation)
+        self.ranks, self.augmentation = ranks, make_augmentation(augment, self.inputs)
         self.origin: dict[str, Any] = {"env": env_id, "seed": seed, "teacher": self.teacher.name}
         if augment is not None:
             self.origin["augment"] = augment if isinstance(augment, str) else getattr(augment, "__name__", "function")
@@ -167,10 +162,37 @@ class _Run:
         self.final = False
         self.result: dict[str, float] = {}
         self.last_result: dict[str, float] = {}
-        self.teacher_episodes: Episodes | None = None
+        self.teacher_episodes = play(pool, self.validation, n_episodes, VALIDATION_SEED, None, self.teacher)
 
-    def run(self, n_steps: int, callback: Callable[[Imitation], None] | None, checkpoint: Path | None) -> Program:
-        """Run all rounds, or those that a checkpoint leaves."""
+    @property
+    def limit(self) -> int:
+        """Steps after which an episode is ended: what takes far longer than the teacher's has failed."""
+        if not len(self.teacher_episodes.successes):
+            return self.pool.cap
+        return min(self.pool.cap, int(2 * self.teacher_episodes.steps.max() + 50))
+
+    def n_rows(self, n_states: int) -> int:
+        """Return in how many environments so many states are visited, so that each sees whole episodes."""
+        return min(len(self.pool), max(1, n_states // self.limit))
+
+    def run(
+        self,
+        visited: Pool,
+        n_states: int,
+        callback: Callable[[Imitation], None] | None,
+        checkpoint: Path | None,
+    ) -> Program:
+        """Run all rounds, or those that a checkpoint leaves.
+
+        :param visited: environments in which states are visited
+        :param n_states: in each round; twice as many in the first
+        :param callback: see :func:`imitate`
+        :param checkpoint: see :func:`imitate`
+        """
+        self.collector = Collector(
+            visited, self.teacher, self.variations, self.ranks, self.seed, self.augmentation, self.limit
+        )
+        n_steps = n_states // len(visited)
         origin = {
             **self.origin,
             "n_steps": n_steps,
@@ -180,24 +202,46 @@ class _Run:
         }
         first = 0
         if checkpoint is not None and checkpoint.exists():
-            first, self.best, self.collector.next_seed = load_state(checkpoint, origin, self.learner)
-            self.collector.rng = np.random.default_rng((self.seed, first))
-            self.runners_up = [self.best] if self.best is not None else []
+            first = self._restore(load_state(checkpoint, origin))
         self.final = first >= N_ROUNDS
-        self.teacher_episodes = play(self.pool, self.validation, self.n_episodes, VALIDATION_SEED, None, self.teacher)
-        self._limit_episodes()
-        self.collector.begin()
         total = N_ROUNDS + N_SPARSE_ROUNDS
         for number in range(first, total):
             self._round(number, n_steps)
             if checkpoint is not None:
-                save_state(checkpoint, origin, number + 1, self.learner, self.best, self.collector.next_seed)
+                save_state(checkpoint, origin, self._state(number + 1))
             if callback is not None:
                 callback(self._progress(number + 1, total))
         return self._program(self._rounded())
 
+    def _state(self, number: int) -> State:
+        learner, collector = self.learner, self.collector
+        return State(
+            number=number,
+            next_seed=collector.next_seed,
+            generators={"learner": learner.rng.bit_generator.state, "collector": collector.rng.bit_generator.state},
+            observations=learner.observations,
+            targets=learner.targets,
+            weights=learner.weights,
+            present=learner.raw,
+            best=self.best,
+            runners_up=tuple(self.runners_up),
+            result=self.result,
+        )
+
+    def _restore(self, state: State) -> int:
+        """Go back to a state; return the number of rounds that are done."""
+        learner, collector = self.learner, self.collector
+        learner.rng.bit_generator.state = state.generators["learner"]
+        collector.rng.bit_generator.state = state.generators["collector"]
+        collector.next_seed = state.next_seed
+        learner.observations, learner.targets, learner.weights = state.observations, state.targets, state.weights
+        learner.raw, self.best, self.runners_up = state.present, state.best, list(state.runners_up)
+        self.result = dict(state.result)
+        return state.number
+
     def _round(self, number: int, n_steps: int) -> None:
         learner = self.learner
+        self.collector.begin()
         share = TEACHER_SHARES[number] if number < len(TEACHER_SHARES) else 0.0
         student = None if learner.raw is None else self._act(learner.raw)
         visits = self.collector.collect(n_steps * (1 if number else 2), student, share)
@@ -282,7 +326,6 @@ class _Run:
 
     @property
     def _teacher_steps(self) -> float:
-        assert self.teacher_episodes is not None
         return float(self.teacher_episodes.steps.mean())
 
     def _play(self, act: Any, needed: float | None = None) -> float:
@@ -295,7 +338,6 @@ class _Run:
         if self.final and (needed is None or self._as_good(score, needed, share=_HOPELESS)):
             episodes = play(self.pool, self.validation, 3 * n_episodes, seed, act)
             score = episodes.score(self._teacher_steps)
-        self.collector.begin()
         self.last_result = episodes.summary()
         return score
 
@@ -306,14 +348,7 @@ class _Run:
 
         return act
 
-    def _limit_episodes(self) -> None:
-        """End episodes of the mixture that take far longer than the teacher's."""
-        assert self.teacher_episodes is not None
-        if len(self.teacher_episodes.successes):
-            self.collector.limit = min(self.pool.cap, int(2 * self.teacher_episodes.steps.max() + 50))
-
     def _progress(self, number: int, total: int) -> Imitation:
-        assert self.teacher_episodes is not None
         assert self.learner.raw is not None
         raw = self.learner.raw if self.best is None else self.best[1]
         in_units = DecisionList(raw.conditions, self.codec.to_action_units(raw.controllers))

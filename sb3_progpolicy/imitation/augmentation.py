@@ -12,31 +12,37 @@ from sb3_progpolicy.nearest import unknown
 #: From observations ``(n, n_observations)`` to changed ones, of the same shape.
 Augment = Callable[[Observations, np.random.Generator], Observations]
 _BLOCK, _MOST_LEVELS, _ON_THE_TABLE = 0.04, 5, 0.03  # metres, blocks, metres
+_PLACED = 0.012  # metres
 
 
 def taller_towers(names: Sequence[str]) -> Augment:
-    """Return what raises the target of a PandaStack observation by some blocks, and for half of them the hand with it.
+    """Return what raises the target of a PandaStack observation by some blocks: the tower is taller than in training.
 
-    A block that is off the table goes with the hand. These are states of towers taller than those of training.
+    The hand goes with it in a third of the states; in the others it is raised by less, as on its way up or down. What
+    it holds goes with the hand, and a block that is in its place with the tower.
 
     :param names: of the numbers of an observation
     :raises ValueError: if it has not the numbers that are changed
     """
-    needed = ("gripper_z", "object_dz", "target_dz", "object_z", "target_z")
+    needed = ("gripper_z", "object_dz", "target_dz", "object_z", "target_z", "distance")
     if missing := [name for name in needed if name not in names]:
         raise ValueError(f"augment='taller_towers' is not accepted: the observation has no {', '.join(missing)}")
-    gripper, object_way, target_way, block, target = (list(names).index(name) for name in needed)
+    gripper, object_way, target_way, block, target, distance = (list(names).index(name) for name in needed)
 
     def augment(observations: Observations, rng: np.random.Generator) -> Observations:
         raised = observations.copy()
-        height = _BLOCK * rng.integers(1, _MOST_LEVELS + 1, size=len(raised))
-        with_hand = rng.random(len(raised)) < 0.5
-        with_block = with_hand & (observations[:, block] > _ON_THE_TABLE)
-        raised[:, target] += height
-        raised[:, gripper] += height * with_hand
-        raised[:, block] += height * with_block
-        raised[:, target_way] += height * ~with_hand
-        raised[:, object_way] -= height * (with_hand & ~with_block)
+        tower = _BLOCK * rng.integers(1, _MOST_LEVELS + 1, size=len(raised))
+        hand = tower * np.where(rng.random(len(raised)) < 1 / 3, 1.0, rng.random(len(raised)))
+        placed = (np.abs(observations[:, block] - observations[:, target]) < _PLACED) & (
+            observations[:, distance] < _PLACED
+        )
+        hand = np.where(placed, tower, hand)
+        moved = np.where(placed | (observations[:, block] > _ON_THE_TABLE), hand, 0.0)
+        raised[:, target] += tower
+        raised[:, gripper] += hand
+        raised[:, block] += moved
+        raised[:, target_way] += tower - hand
+        raised[:, object_way] += moved - hand
         return raised
 
     return augment

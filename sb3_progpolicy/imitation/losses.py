@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 _DELTA = 0.1  # Huber's: errors beyond it count by their size, not its square
 _SATURATED = 0.999
 _OVERSHOOT = 0.15  # weight of too much along a direction that the teacher has shortened to fit into the bounds
+_SMALL = 0.1  # labels up to it count as meant, not as shortened
 _MAX_NATS = 3.0  # a wrong decision costs no more than this, however sure it is
 _SUPPORTS = (0, 1, 2, 3, 4, 6, 8, 12)
 
@@ -142,7 +143,8 @@ class BoxLoss:
         if self.direction:
             columns = list(self.direction)
             saturated = np.abs(targets[:, columns]) >= _SATURATED
-            slack[:, columns] = np.where(saturated.any(axis=1, keepdims=True) & ~saturated, _OVERSHOOT, 1.0)
+            shortened = saturated.any(axis=1, keepdims=True) & ~saturated & (np.abs(targets[:, columns]) > _SMALL)
+            slack[:, columns] = np.where(shortened, _OVERSHOOT, 1.0)
         return slack
 
     def _reweighted(self, data: Data, row: Floats, output: int, slack: Floats) -> Floats:

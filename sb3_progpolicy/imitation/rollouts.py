@@ -85,6 +85,12 @@ class Pool:
         for env in self.envs:
             env.close()
 
+    def __enter__(self) -> Pool:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
 
 @dataclass(frozen=True)
 class Episodes:
@@ -205,7 +211,7 @@ class Visits:
 
 
 class Collector:
-    """Environments that go on between calls, in which teacher and student take turns (Ross et al. 2011).
+    """Environments in which teacher and student take turns (Ross et al. 2011).
 
     Larger variations are drawn more often, since their ends are states of the smaller ones: each size twice as often as
     the one before. In an environment with a goal, a student that comes to the same state for the third time in an
@@ -217,6 +223,7 @@ class Collector:
     :param ranks: size of each variation as a number from 0 on
     :param seed: of the draws and of the episodes
     :param augment: makes changed copies of half of the states, which are labelled too
+    :param limit: steps after which an episode is ended; by default the environment's own
     """
 
     def __init__(
@@ -227,6 +234,7 @@ class Collector:
         ranks: Sequence[int],
         seed: int,
         augment: Augment | None = None,
+        limit: int | None = None,
     ) -> None:
         self.augment = augment
         self.pool, self.teacher, self.variations = pool, teacher, variations
@@ -234,7 +242,7 @@ class Collector:
         self.chances = chances / chances.sum()
         self.rng = np.random.default_rng(seed)
         self.next_seed = 100_000 * (seed + 1)
-        self.limit = pool.cap
+        self.limit = pool.cap if limit is None else limit
         self._guided, self._left = np.zeros(len(pool), dtype=bool), np.zeros(len(pool), dtype=np.int64)
         self._elapsed = np.zeros(len(pool), dtype=np.int64)
         self._seen: list[dict[str | bytes, int]] = [{} for _ in range(len(pool))]
