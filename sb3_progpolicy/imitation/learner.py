@@ -113,6 +113,26 @@ class Learner:
         sparse = sparsify(self.loss, self._scaled(raw, scaler), self._some(data, _MANY), tolerance, always_few)
         return self._refitted(sparse, data, scaler, self.settings.final_steps)
 
+    def rare_branches(self, raw: DecisionList, share: float) -> list[int]:
+        """Return the branches that act in fewer states than a share, the rarest first.
+
+        :param raw: on raw observations
+        :param share: of all labelled states
+        """
+        scaler, data = self._prepared()
+        acting = self._scaled(raw, scaler).branches(data.inputs)
+        shares = np.bincount(acting, minlength=raw.n_branches) / len(data)
+        return [int(index) for index in np.argsort(shares, kind="stable") if shares[index] < share]
+
+    def without(self, raw: DecisionList, index: int) -> DecisionList:
+        """Return a list without a branch, its numbers that are not 0 fitted again.
+
+        :param raw: on raw observations
+        :param index: of the branch
+        """
+        scaler, data = self._prepared()
+        return self._refitted(self._scaled(raw.without(index), scaler), data, scaler, self.settings.round_steps)
+
     def refit_sparse(self) -> DecisionList:
         """Fit the numbers of the present list that are not 0 to all states, and return it."""
         assert self.raw is not None

@@ -18,6 +18,7 @@ _OVERSHOOT = 0.15  # weight of too much along a direction that the teacher has s
 _SMALL = 0.1  # labels up to it count as meant, not as shortened
 _MAX_NATS = 3.0  # a wrong decision costs no more than this, however sure it is
 _SUPPORTS = (0, 1, 2, 3, 4, 6, 8, 12)
+_FEW = 6  # inputs
 
 
 class Loss(Protocol):
@@ -32,7 +33,7 @@ class Loss(Protocol):
     def fit_sparse(self, data: Data, start: Floats, tolerance: float, always_few: bool = False) -> Floats:
         """Return the controller of fewest inputs whose mean loss is at most ``tolerance`` above the least.
 
-        With ``always_few`` it is one of few inputs even if none is within the tolerance.
+        With ``always_few`` it is one of at most six inputs for each output even if none is within the tolerance.
         """
 
     def expected(self, outputs: th.Tensor, targets: th.Tensor) -> th.Tensor:
@@ -111,7 +112,7 @@ class BoxLoss:
             supports = eliminate(hessian, full[output])
             limit = self._one(data, full[output], output, slack) + tolerance
             least = np.inf
-            for size in _SUPPORTS:
+            for size in _SUPPORTS[: _SUPPORTS.index(_FEW) + 1] if always_few else _SUPPORTS:
                 support = next(kept for kept, _ in supports if kept.sum() <= size + 1)
                 row = self._fit_support(data, output, support, slack)
                 reached = self._one(data, row, output, slack)

@@ -149,6 +149,8 @@ def play(
         if teacher is not None:
             teacher.begin()
         pool.begin()
+        if isinstance(act, ProgramAct):
+            act.begin()
         for row in rows:
             pool.reset(row, seed + first + row, variations[(first + row) % len(variations)])
         live = list(rows)
@@ -184,10 +186,28 @@ def _labels(pool: Pool, teacher: Teacher | None, live: Sequence[int]) -> NDArray
     return labels
 
 
-def program_act(program: ProgramData, n_envs: int) -> Act:
+class ProgramAct:
+    """The crisp program as a function from observations to actions, which remembers.
+
+    :param program: the program
+    :param n_envs: number of rows of observations
+    """
+
+    def __init__(self, program: ProgramData, n_envs: int) -> None:
+        self._runner = ProgramRunner(program, n_envs)
+
+    def begin(self) -> None:
+        """Forget everything: other episodes are played from now on."""
+        self._runner.reset()
+
+    def __call__(self, observations: Observations) -> NDArray[Any]:
+        """Return actions ``(n_envs, *action_shape)``."""
+        return self._runner.act(observations)
+
+
+def program_act(program: ProgramData, n_envs: int) -> ProgramAct:
     """Return the crisp program as a function from observations to actions."""
-    runner = ProgramRunner(program, n_envs)
-    return lambda observations: runner.act(observations)
+    return ProgramAct(program, n_envs)
 
 
 @dataclass

@@ -61,7 +61,7 @@ def fine_tune(
         rows = th.randint(len(data), (batch_size,), generator=generator)
         outputs = th.einsum("nd,kod->nko", inputs[rows], controllers)
         losses = loss.expected(outputs, targets[rows])
-        chances = _branch_chances(inputs[rows] @ conditions.T / (first * (last / first) ** done))
+        chances = branch_chances(inputs[rows] @ conditions.T / (first * (last / first) ** done))
         objective = ((chances * losses).sum(dim=1) * weights[rows]).mean()
         optimizer.zero_grad()
         objective.backward()
@@ -73,7 +73,7 @@ def fine_tune(
     return DecisionList(conditions.detach().double().numpy(), controllers.detach().double().numpy())
 
 
-def _branch_chances(values: th.Tensor) -> th.Tensor:
+def branch_chances(values: th.Tensor) -> th.Tensor:
     """Return how likely each branch acts, ``(n, n_branches)``, for the conditions' values ``(n, n_branches - 1)``."""
     import torch as th
 

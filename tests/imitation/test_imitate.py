@@ -16,10 +16,11 @@ from progpolicy_envs.panda import PandaStackEnv
 from sb3_progpolicy import compare_with_teacher, evaluate_program, imitate, load_pretrained
 from sb3_progpolicy.cli import run
 from sb3_progpolicy.imitation import algorithm, make_teacher
-from sb3_progpolicy.imitation.algorithm import training_variations
 from sb3_progpolicy.imitation.augmentation import taller_towers
+from sb3_progpolicy.imitation.decision_list import DecisionList
 from sb3_progpolicy.imitation.learner import Settings
 from sb3_progpolicy.imitation.rollouts import STALL_WEIGHT, Collector, Pool, play
+from sb3_progpolicy.imitation.tasks import training_variations
 from sb3_progpolicy.interaction import VecInteractionHistory
 from sb3_progpolicy.programs import Program, ProgramRunner
 
@@ -122,6 +123,20 @@ def test_interrupted_imitation_goes_on_as_if_nothing_had_happened(balanced, tmp_
         imitate(balance, "CartPole-v1", seed=9, checkpoint=state, **SMALL)
 
 
+def test_branches_that_hardly_ever_act_go_while_episodes_stay_as_good():
+    with Pool("CartPole-v1", 8) as pool:
+        run = algorithm._Run(pool, balance, "CartPole-v1", None, 0, 3, (), 8, 0.015, None)
+        states = np.random.default_rng(0).normal(scale=0.1, size=(500, 4)).astype(np.float32)
+        run.learner.add(states, run.codec.encode(balance(states)), np.ones(500))
+        rule = np.array([[-0.1, -0.5, -1, -1, 0], [0.1, 0.5, 1, 1, 0]]) * 20
+        rare = DecisionList(np.array([[0, 0, 0, 0, -1.0], [0, 0, 0, 0, 1.0]]), np.array([rule, rule, rule]))
+        run.best = run._score(rare), rare
+        run._drop_rare_branches()
+    assert run.learner.rare_branches(rare, 0.03) == [0, 2]
+    assert run.best[1].n_branches == 1
+    assert run.result["return"] == 500
+
+
 def test_planner_is_imitated_on_training_variations_only(monkeypatch):
     seen = set()
     reset = Pool.reset
@@ -142,7 +157,7 @@ def test_planner_is_imitated_on_training_variations_only(monkeypatch):
         ({"teacher": "expert"}, "'expert' is not accepted; it is 'planner'"),
         ({"teacher": 3}, "teacher=3 is not accepted"),
         ({"teacher": "planner"}, "CartPole-v1 has no planner"),
-        ({"cell": "gru"}, "cell='gru' is not accepted"),
+        ({"cell": "lstm"}, "cell='lstm' is not accepted"),
         ({"n_timesteps": 5}, "n_timesteps=5"),
         ({"tasks": []}, "at least one variation"),
         ({"env_id": "CartPol-v1"}, "unknown environment"),
