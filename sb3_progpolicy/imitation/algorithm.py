@@ -29,11 +29,14 @@ from sb3_progpolicy.spaces import action_spec
 TEACHER_SHARES = (1.0, 0.6, 0.4, 0.3, 0.2, 0.1)
 N_ROUNDS, N_SPARSE_ROUNDS = 9, 2
 # Of the mean loss, and whether few inputs matter more; the sparsest program first.
-_TOLERANCES = ((0.012, True), (0.006, True), (0.003, True), (0.003, False), (0.001, False))
+_TOLERANCES = ((0.012, True), (0.004, True), (0.003, False), (0.001, False))
 _FINALISTS = 3
 _CHANGED = 0.02  # share of the actions, or mean distance, that rounding may change
-_RARE, _DROPS = 0.03, 8  # share of the states in which a rare branch acts; how many are tried without
-_SHORT = (1, 2, 4, 7)  # numbers of branches that are tried at the end
+_RARE, _DROPS = 0.03, 5  # share of the states in which a rare branch acts; how many are tried without
+# A list whose loss is so many times the best one's is not looked at; less is allowed where episodes do not show all
+# that was learned.
+_NEAR, _NEAR_AUGMENTED, _LOSS = 2.0, 1.2, 0.01
+_SHORT = (7, 4, 2, 1)  # numbers of branches that are tried at the end
 _DIGITS = (2, 3, 4, 6)
 #: Inputs that are not read by default: beyond the training sizes they take values that were never seen.
 IGNORED = ("left",)
@@ -102,7 +105,7 @@ def imitate(
     :param interaction: whether the program reads its previous action, reward and done flag, too
     :param ignore: names of inputs that the program must not read
     :param score_tolerance: share of the score that fewer and rounder numbers may cost
-    :param n_episodes: of each validation, on training variations; the last ones have three times as many
+    :param n_episodes: of each validation, on training variations; the last ones have twice as many
     :param env_kwargs: constructor arguments of the environment
     :param augment: makes states that were not visited, which the teacher labels too: a function from observations and
         a generator to observations, or ``"taller_towers"`` for PandaStack. What was learned so was shown more than the
@@ -172,6 +175,7 @@ class _Run:
         self.learner = Learner(self.codec, readable, Settings(max_branches, seed))
         self.best: Scored | None = None
         self.runners_up: list[Scored] = []
+        self.loss_limit = np.inf
         self.n_labelled = 0
         self.result: dict[str, float] = {}
 
@@ -302,18 +306,17 @@ class _Run:
         self.best = None
         for _, candidate in list(self.runners_up):
             self._offer(candidate)
+        assert self.best is not None
+        self.learner.raw = self.best[1]
+        factor = _NEAR if self.augmentation is None else _NEAR_AUGMENTED
+        self.loss_limit = factor * self.learner.loss_of(self.best[1]) + _LOSS
 
     def _make_short(self) -> None:
-        """Go on with a list of fewer branches if its episodes are as good as the best ones."""
+        """Go on with lists of fewer and fewer branches as long as their episodes are as good as the best ones."""
         assert self.best is not None
         score, best = self.best
         for n_branches in (number for number in _SHORT if number < best.n_branches):
-            short = self.learner.short(n_branches)
-            if not self.learner.is_near(short, best):
-                continue
-            reached = self._score(short, score)
-            if self.judge.as_good(reached, score):
-                self.best, self.result = (reached, short), self.judge.last_result
+            if not self._take_over(self.learner.short(n_branches), score):
                 return
 
     def _make_sparse(self) -> None:
@@ -321,31 +324,33 @@ class _Run:
         assert self.best is not None
         score, dense = self.best
         for tolerance, always_few in _TOLERANCES:
-            sparse = self.learner.sparse(dense, tolerance, always_few)
-            reached = self._score(sparse, score)
-            if self.judge.as_good(reached, score):
-                self.best, self.learner.raw, self.result = (reached, sparse), sparse, self.judge.last_result
+            if self._take_over(self.learner.sparse(dense, tolerance, always_few), score):
                 return
-        self.learner.raw = dense
 
     def _drop_rare_branches(self) -> None:
         """Leave out branches that hardly ever act, one after another, as long as the episodes stay as good."""
         assert self.best is not None
-        score, program = self.best
+        score, _ = self.best
         tries = 0
-        while tries < _DROPS and program.n_branches > 1:
-            for index in self.learner.rare_branches(program, _RARE):
-                tries += 1
-                fewer = self.learner.without(program, index)
-                reached = self._score(fewer, score)
-                if self.judge.as_good(reached, score):
-                    program = self.learner.raw = fewer
-                    self.best, self.result = (reached, fewer), self.judge.last_result
-                    break
+        while self.best[1].n_branches > 1:
+            for index in self.learner.rare_branches(self.best[1], _RARE):
                 if tries == _DROPS:
                     return
+                tries += 1
+                if self._take_over(self.learner.without(self.best[1], index), score):
+                    break
             else:
                 return
+
+    def _take_over(self, candidate: DecisionList, score: float) -> bool:
+        """Go on with a smaller list if its loss is not far from the best one's and its episodes are as good."""
+        if self.learner.loss_of(candidate) > self.loss_limit:
+            return False
+        reached = self._score(candidate, score)
+        if not self.judge.as_good(reached, score):
+            return False
+        self.best, self.learner.raw, self.result = (reached, candidate), candidate, self.judge.last_result
+        return True
 
     def _offer(self, candidate: DecisionList, sparse: bool = False) -> None:
         """Keep a candidate if its episodes are better than the best so far."""

@@ -9,40 +9,50 @@ import numpy as np
 from sb3_progpolicy.imitation.teachers import Observations
 from sb3_progpolicy.nearest import unknown
 
-#: From observations ``(n, n_observations)`` to changed ones, of the same shape.
+#: From observations ``(n, n_observations)`` to changed ones, ``(m, n_observations)``.
 Augment = Callable[[Observations, np.random.Generator], Observations]
 _BLOCK, _MOST_LEVELS, _ON_THE_TABLE = 0.04, 5, 0.03  # metres, blocks, metres
 _PLACED = 0.012  # metres
+_NEAR, _ABOVE = (0.12, 0.2), 0.05  # of the hand from the tower, along x and y, and over it, metres
+_TIMES = 3  # so many states are made of one near the tower, where a mistake throws it over
 
 
 def taller_towers(names: Sequence[str]) -> Augment:
     """Return what raises the target of a PandaStack observation by some blocks: the tower is taller than in training.
 
-    The hand goes with it in a third of the states; in the others it is raised by less, as on its way up or down. What
-    it holds goes with the hand, and a block that is in its place with the tower.
+    The hand goes with it where it is over the tower, and in a third of the other states; else it is raised by less, as
+    on its way up or down. What it holds goes with the hand, and a block that is in its place with the tower.
 
     :param names: of the numbers of an observation
     :raises ValueError: if it has not the numbers that are changed
     """
-    needed = ("gripper_z", "object_dz", "target_dz", "object_z", "target_z", "distance")
+    needed = ("gripper_z", "object_dz", "target_dx", "target_dy", "target_dz", "distance", "object_z", "target_z")
     if missing := [name for name in needed if name not in names]:
         raise ValueError(f"augment='taller_towers' is not accepted: the observation has no {', '.join(missing)}")
-    gripper, object_way, target_way, block, target, distance = (list(names).index(name) for name in needed)
+    place = {name: list(names).index(name) for name in needed}
 
     def augment(observations: Observations, rng: np.random.Generator) -> Observations:
-        raised = observations.copy()
+        def near(beyond: Sequence[float]) -> np.ndarray:
+            ways = np.abs(observations[:, [place["target_dx"], place["target_dy"]]])
+            return np.asarray((ways < np.array(beyond)).all(axis=1))
+
+        observations = np.repeat(observations, np.where(near(_NEAR), _TIMES, 1), axis=0)
+        raised, over = observations.copy(), near((_ABOVE, _ABOVE))
+        block = observations[:, place["object_z"]]
+        placed = np.abs(block - observations[:, place["target_z"]]) < _PLACED
+        placed &= observations[:, place["distance"]] < _PLACED
         tower = _BLOCK * rng.integers(1, _MOST_LEVELS + 1, size=len(raised))
         hand = tower * np.where(rng.random(len(raised)) < 1 / 3, 1.0, rng.random(len(raised)))
-        placed = (np.abs(observations[:, block] - observations[:, target]) < _PLACED) & (
-            observations[:, distance] < _PLACED
-        )
-        hand = np.where(placed, tower, hand)
-        moved = np.where(placed | (observations[:, block] > _ON_THE_TABLE), hand, 0.0)
-        raised[:, target] += tower
-        raised[:, gripper] += hand
-        raised[:, block] += moved
-        raised[:, target_way] += tower - hand
-        raised[:, object_way] += moved - hand
+        hand = np.where(placed | over, tower, hand)
+        moved = np.where(placed | (block > _ON_THE_TABLE), hand, 0.0)
+        for name, way in (
+            ("target_z", tower),
+            ("gripper_z", hand),
+            ("object_z", moved),
+            ("target_dz", tower - hand),
+            ("object_dz", moved - hand),
+        ):
+            raised[:, place[name]] += way
         return raised
 
     return augment

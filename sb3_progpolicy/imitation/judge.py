@@ -15,7 +15,7 @@ class Judge:
 
     :param pool: environments to play in
     :param variations: to play on, in turn
-    :param n_episodes: of each validation; the last ones have three times as many
+    :param n_episodes: of each validation; the last ones have twice as many
     :param tolerance: share of the score within which another one is as good
     :param teacher: whose steps are the unit of steps
     """
@@ -36,7 +36,7 @@ class Judge:
         return min(self.pool.cap, int(2 * self.teacher_episodes.steps.max() + 50))
 
     def score(self, act: Act, needed: float | None = None) -> float:
-        """Return the score of episodes; in the last validations, if a third is far from what is needed, that of these.
+        """Return the score of episodes; in the last validations of half of them, if these are far from what is needed.
 
         :param act: the candidate
         :param needed: a score to compare with
@@ -47,7 +47,7 @@ class Judge:
         episodes = play(self.pool, self.variations, self.n_episodes, seed, act)
         score = episodes.score(steps)
         if self.final and (needed is None or self.as_good(score, needed, share=_HOPELESS)):
-            episodes = play(self.pool, self.variations, 3 * self.n_episodes, seed, act)
+            episodes = play(self.pool, self.variations, 2 * self.n_episodes, seed, act)
             score = episodes.score(steps)
         self.last_result = episodes.summary()
         return score

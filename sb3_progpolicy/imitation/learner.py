@@ -16,7 +16,6 @@ from sb3_progpolicy.imitation.tuning import fine_tune
 _FEW, _MANY = 6_000, 15_000  # states for a fit from nothing, and for one that only improves
 _REFIT_EVERY = 3  # rounds
 _COMPETES = 1.3  # a list whose loss is so many times the least has its episodes looked at, too
-_NEAR = 2.0  # times the loss of a list: a shorter one beyond it is not looked at
 _RESTARTS = 3  # of the fit by planes
 
 
@@ -33,7 +32,7 @@ class Settings:
     max_branches: int
     seed: int
     round_steps: int = 400
-    final_steps: int = 2000
+    final_steps: int = 1200
 
 
 class Learner:
@@ -96,11 +95,13 @@ class Learner:
         polished = [self._polished(program, data, 0.3) for program in fresh]
         return _raw(min(polished, key=lambda program: mean_loss(self.loss, program, data)), scaler)
 
-    def is_near(self, raw: DecisionList, other: DecisionList) -> bool:
-        """Return whether the loss of a list is so near another's that its episodes are worth a look."""
+    def loss_of(self, raw: DecisionList) -> float:
+        """Return the mean loss of a list in all labelled states.
+
+        :param raw: on raw observations
+        """
         scaler, data = self._prepared()
-        one, two = (mean_loss(self.loss, self._scaled(program, scaler), data) for program in (raw, other))
-        return one <= _NEAR * two + 0.01
+        return mean_loss(self.loss, self._scaled(raw, scaler), data)
 
     def sparse(self, raw: DecisionList, tolerance: float, always_few: bool) -> DecisionList:
         """Return a list with few inputs, fitted again with these alone.

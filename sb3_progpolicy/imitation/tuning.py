@@ -23,7 +23,7 @@ def fine_tune(
     seed: int,
     temperatures: tuple[float, float] = (0.3, 0.03),
     learning_rate: float = 3e-3,
-    batch_size: int = 1024,
+    batch_size: int = 512,
     keep_zeros: bool = False,
 ) -> DecisionList:
     """Return the list after Adam on the expected loss of the branch drawn by the conditions' sigmoids.

@@ -72,7 +72,7 @@ def test_taller_towers_are_labelled_by_the_scripted_controller():
     names = PandaStackEnv.observation_names
     place = {name: index for index, name in enumerate(names)}
     low = np.zeros((400, len(names)), np.float32)
-    low[:, place["distance"]] = 0.2
+    low[:, [place["distance"], place["target_dx"]]] = 0.2
     raised = taller_towers(names)(low, np.random.default_rng(0))
     assert (raised[:, place["target_z"]] > 0.03).all()
     moved = {names[column] for column in np.flatnonzero((raised != low).any(axis=0))}
@@ -82,8 +82,11 @@ def test_taller_towers_are_labelled_by_the_scripted_controller():
         np.testing.assert_allclose(raised[:, place[way]], difference, atol=1e-6)
     low[:, place["distance"]] = 0.0  # a block in its place goes with the tower
     raised = taller_towers(names)(low, np.random.default_rng(0))
-    moved = {names[column] for column in np.flatnonzero((raised != low).any(axis=0))}
-    assert moved == {"gripper_z", "target_z", "object_z"}
+    assert (raised[:, place["object_z"]] == raised[:, place["target_z"]]).all()
+    low[:, place["target_dx"]] = 0.0  # near the tower there are more of them, and the hand over it goes with it
+    raised = taller_towers(names)(low, np.random.default_rng(0))
+    assert len(raised) == 3 * len(low)
+    assert {names[column] for column in np.flatnonzero(raised.any(axis=0))} == {"gripper_z", "target_z", "object_z"}
     with pytest.raises(ValueError, match="has no gripper_z"):
         imitate("planner", "Stacking-v0", augment="taller_towers")
     with pytest.raises(ValueError, match="needs more than an observation"):
