@@ -38,7 +38,7 @@ from sb3_progpolicy.programs.files import write_atomically
 
 COLUMNS = (
     *("seed", "set", "variation", "episodes", "success_rate", "steps_mean", "return_mean"),
-    *("n_conditions", "n_numbers", "n_lines", "cpu_seconds", "commit"),
+    *("n_conditions", "n_numbers", "n_lines", "cpu_seconds", "learned_by", "commit"),
 )
 EVALUATION_SEED = 10_000
 PROGRAMS = RESULTS / "programs"
@@ -121,7 +121,14 @@ def _about(program: Program | None) -> dict[str, Any]:
         "n_numbers": count_numbers(program),
         "n_lines": sum(bool(line) for line in str(program).splitlines()),
         "cpu_seconds": program.metadata.get("cpu_seconds", ""),
+        "learned_by": learned_by(program),
     }
+
+
+def learned_by(program: Program) -> str:
+    """Return how a program was learned, and what it was shown beyond the training variations."""
+    augmentation = program.metadata.get("augment")
+    return program.learned_by + (f", {augmentation}" if augmentation else "")
 
 
 def trained_ppo(env_id: str, n_timesteps: int, folder: Path) -> Any:
