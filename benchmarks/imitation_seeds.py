@@ -57,10 +57,28 @@ def learn(teacher: Any, env_id: str, seed: int, folder: Path, arguments: dict[st
     program = imitate(teacher, env_id, seed=seed, checkpoint=state, callback=after_round, **arguments)
     seconds = round(before + time.process_time() - started, 1)
     state.unlink()
+    clock.unlink()
     return dataclasses.replace(program, metadata={**program.metadata, "cpu_seconds": seconds})
 
 
-def known_rows(name: str, arguments: dict[str, Any], episodes: int, final: bool) -> dict[str, list[dict[str, Any]]]:
+Wanted = list[tuple[str, Any]]
+
+
+def wanted_variations(env_id: str, final: bool, sizes: list[int] | None) -> Wanted:
+    """Return the set and the variation of each row, of all sizes or of some."""
+    domain = find_domain(env_id)
+    if domain is None:
+        return [("train", {})]
+    parts = {"train": domain.train, **({"validation": domain.validation, "unseen": domain.unseen} if final else {})}
+    return [
+        (kind, variation)
+        for kind, variations in parts.items()
+        for variation in variations
+        if sizes is None or variation[domain.size] in sizes
+    ]
+
+
+def known_rows(name: str, arguments: dict[str, Any], episodes: int, wanted: Wanted) -> dict[str, list[dict[str, Any]]]:
     """Return the rows that an earlier run of the same study has left, by seed."""
     table, origin = RESULTS / f"{name}.csv", RESULTS / f"{name}.json"
     if not (table.exists() and origin.exists()):
@@ -76,39 +94,42 @@ def known_rows(name: str, arguments: dict[str, Any], episodes: int, final: bool)
         for column in ("success_rate", "steps_mean", "return_mean"):
             row[column] = float(row[column]) if row[column] else ""
         found.setdefault(row["seed"], []).append(row)
-    whole = {"train", "validation", "unseen"} if final else {"train"}
+    whole = [(kind, _named(variation)) for kind, variation in wanted]
     return {
         seed: own
         for seed, own in found.items()
-        if whole <= {row["set"] for row in own} and all(row["episodes"] == str(episodes) for row in own)
+        if whole == [(row["set"], row["variation"]) for row in own]
+        and all(row["episodes"] == str(episodes) for row in own)
     }
 
 
-def rows_of(seed: Any, env_id: str, teacher: Any, program: Program | None, episodes: int, final: bool) -> list[Any]:
+def rows_of(
+    seed: Any, env_id: str, teacher: Any, program: Program | None, episodes: int, wanted: Wanted
+) -> list[dict[str, Any]]:
     """Run the program, or the teacher if there is none, on the variations."""
-    domain, rows = find_domain(env_id), []
-    sets = [("train", domain.train if domain is not None else ({},))]
-    if domain is not None and final:
-        sets += [("validation", domain.validation), ("unseen", domain.unseen)]
+    rows: list[dict[str, Any]] = []
     about = {"seed": seed, **_about(program), "commit": commit()}
     with Pool(env_id, min(episodes, 25), interaction=program is not None and program.interaction) as pool:
         judge = make_teacher(teacher, pool.envs[0])
         act = None if program is None else program_act(program, len(pool))
-        for kind, variations in sets:
-            for variation in variations:
-                played = play(pool, [variation], episodes, EVALUATION_SEED, act, judge)
-                rows.append({"set": kind, **_row(variation, played), **about})
+        for kind, variation in wanted:
+            played = play(pool, [variation], episodes, EVALUATION_SEED, act, judge)
+            rows.append({"set": kind, **_row(variation, played), **about})
     return rows
 
 
 def _row(variation: Any, played: Episodes) -> dict[str, Any]:
     return {
-        "variation": ", ".join(f"{name}={value}" for name, value in variation.items()),
+        "variation": _named(variation),
         "episodes": len(played.returns),
         "success_rate": float(played.successes.mean()) if len(played.successes) else "",
         "steps_mean": round(float(played.steps.mean()), 2),
         "return_mean": round(float(played.returns.mean()), 3),
     }
+
+
+def _named(variation: Any) -> str:
+    return ", ".join(f"{name}={value}" for name, value in variation.items())
 
 
 def _about(program: Program | None) -> dict[str, Any]:
@@ -157,6 +178,7 @@ def main() -> None:
     parser.add_argument("--augment", help="label states that were not visited, too: taller_towers")
     parser.add_argument("--ppo", type=int, help="imitate a network that PPO has trained for so many steps")
     parser.add_argument("--final", action="store_true", help="look at the validation and the unseen variations, too")
+    parser.add_argument("--sizes", type=int, nargs="+", help="sizes to run on; by default all")
     parser.add_argument("--name", help="name of the result files; that of the domain by default")
     options = parser.parse_args()
     th.set_num_threads(1)
@@ -170,14 +192,15 @@ def main() -> None:
     if options.set:
         arguments["tasks"] = parse_variations(options.set)
     teacher = trained_ppo(options.env, options.ppo, folder) if options.ppo else "planner"
-    known = known_rows(name, arguments, options.episodes, options.final)
+    wanted = wanted_variations(options.env, options.final, options.sizes)
+    known = known_rows(name, arguments, options.episodes, wanted)
     rows: list[dict[str, Any]] = []
     for seed in track(["teacher", *map(str, range(options.seeds))], "Seeds"):
         if seed not in known:
             program = None if seed == "teacher" else learn(teacher, options.env, int(seed), folder, arguments)
             if program is not None:
                 program.save(PROGRAMS / f"{name}_{seed}.json")
-            known[seed] = rows_of(seed, options.env, teacher, program, options.episodes, options.final)
+            known[seed] = rows_of(seed, options.env, teacher, program, options.episodes, wanted)
         rows += known[seed]
         write_results(name, COLUMNS, rows, arguments)
     for variation in dict.fromkeys(row["variation"] for row in rows):

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from imitation_seeds import EVALUATION_SEED, _row
+from imitation_seeds import EVALUATION_SEED, _row, wanted_variations
 from study import write_results
 
 from progpolicy_envs import find_domain
@@ -93,11 +93,11 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=100, help="episodes on each variation")
     parser.add_argument("--augment", help="label states that were not visited, too: taller_towers")
     parser.add_argument("--seed", type=int, default=0, help="of all draws")
+    parser.add_argument("--sizes", type=int, nargs="+", help="sizes to run on; by default all")
     parser.add_argument("--final", action="store_true", help="look at the unseen variations, too")
     options = parser.parse_args()
-    domain = find_domain(options.env)
-    assert domain is not None, f"{options.env} has no planner"
-    sets = [("train", domain.train), *([("unseen", domain.unseen)] if options.final else [])]
+    assert find_domain(options.env) is not None, f"{options.env} has no planner"
+    wanted = wanted_variations(options.env, options.final, options.sizes)
     learned = "imitation" + (f", {options.augment}" if options.augment else "")
     rows = []
     pool = Pool(options.env, _N_ENVS)
@@ -105,12 +105,11 @@ def main() -> None:
         started = time.process_time()
         act = learn(make, pool, options.env, options.n_timesteps, options.seed, options.augment)
         seconds = round(time.process_time() - started, 1)
-        for kind, variations in sets:
-            for variation in variations:
-                played = play(pool, [variation], options.episodes, EVALUATION_SEED, act)
-                about = {"student": name, "learned_by": learned, "set": kind, "cpu_seconds": seconds}
-                rows.append({**about, **_row(variation, played)})
-                print(rows[-1])
+        for kind, variation in wanted:
+            played = play(pool, [variation], options.episodes, EVALUATION_SEED, act)
+            about = {"student": name, "learned_by": learned, "set": kind, "cpu_seconds": seconds}
+            rows.append({**about, **_row(variation, played)})
+            print(rows[-1])
     pool.close()
     file = f"imitation_yardsticks_{options.env.rpartition('-')[0].lower()}"
     file += f"_{options.augment}" if options.augment else ""
