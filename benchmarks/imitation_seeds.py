@@ -175,7 +175,7 @@ def main() -> None:
     parser.add_argument("--max-conditions", type=int, default=11, help="of the program at most")
     parser.add_argument("--interaction", action="store_true", help="read the previous action, reward and done flag")
     parser.add_argument("--set", nargs="+", help="variations to learn on, as name=value; by default the training ones")
-    parser.add_argument("--augment", help="label states that were not visited, too: taller_towers")
+    parser.add_argument("--augment", help="more than the training variations: taller_towers or begun_towers")
     parser.add_argument("--ppo", type=int, help="imitate a network that PPO has trained for so many steps")
     parser.add_argument("--final", action="store_true", help="look at the validation and the unseen variations, too")
     parser.add_argument("--sizes", type=int, nargs="+", help="sizes to run on; by default all")

@@ -25,7 +25,7 @@ from progpolicy_envs import find_domain
 from sb3_progpolicy.imitation import make_teacher
 from sb3_progpolicy.imitation.actions import ActionCodec
 from sb3_progpolicy.imitation.algorithm import N_ROUNDS, N_SPARSE_ROUNDS, TEACHER_SHARES
-from sb3_progpolicy.imitation.augmentation import make_augmentation
+from sb3_progpolicy.imitation.augmentation import make_augmentation, make_starts
 from sb3_progpolicy.imitation.decision_list import Scaler
 from sb3_progpolicy.imitation.rollouts import Act, Collector, Pool, play
 from sb3_progpolicy.imitation.tasks import names_of, training_variations
@@ -91,7 +91,7 @@ def main() -> None:
     parser.add_argument("--branches", type=int, default=9, help="leaves of the small tree")
     parser.add_argument("--n-timesteps", type=int, default=24_000, help="states to label")
     parser.add_argument("--episodes", type=int, default=100, help="episodes on each variation")
-    parser.add_argument("--augment", help="label states that were not visited, too: taller_towers")
+    parser.add_argument("--augment", help="more than the training variations: taller_towers or begun_towers")
     parser.add_argument("--seed", type=int, default=0, help="of all draws")
     parser.add_argument("--sizes", type=int, nargs="+", help="sizes to run on; by default all")
     parser.add_argument("--final", action="store_true", help="look at the unseen variations, too")
@@ -100,10 +100,10 @@ def main() -> None:
     wanted = wanted_variations(options.env, options.final, options.sizes)
     learned = "imitation" + (f", {options.augment}" if options.augment else "")
     rows = []
-    pool = Pool(options.env, _N_ENVS)
+    pool, visited = Pool(options.env, _N_ENVS), Pool(options.env, _N_ENVS, begin=make_starts(options.augment))
     for name, make in students(options.branches, options.seed).items():
         started = time.process_time()
-        act = learn(make, pool, options.env, options.n_timesteps, options.seed, options.augment)
+        act = learn(make, visited, options.env, options.n_timesteps, options.seed, options.augment)
         seconds = round(time.process_time() - started, 1)
         for kind, variation in wanted:
             played = play(pool, [variation], options.episodes, EVALUATION_SEED, act)
@@ -111,6 +111,7 @@ def main() -> None:
             rows.append({**about, **_row(variation, played)})
             print(rows[-1])
     pool.close()
+    visited.close()
     file = f"imitation_yardsticks_{options.env.rpartition('-')[0].lower()}"
     file += f"_{options.augment}" if options.augment else ""
     arguments = {"n_timesteps": options.n_timesteps, "augment": options.augment}

@@ -33,7 +33,10 @@ def distill(
         bool, typer.Option("--interaction", help="let it read its previous action, reward and done flag, too")
     ] = False,
     augment: Annotated[
-        str | None, typer.Option("--augment", help="label states that were not visited, too: taller_towers")
+        str | None,
+        typer.Option(
+            "--augment", help="more than the training variations, for PandaStack: taller_towers or begun_towers"
+        ),
     ] = None,
     episodes: Annotated[int, typer.Option("--episodes", min=1, help="of the comparison with the teacher")] = 30,
     as_json: Annotated[bool, typer.Option("--json", help="a JSON object on stdout, nothing else")] = False,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sb3_progpolicy.imitation.actions import ActionCodec
-from sb3_progpolicy.imitation.augmentation import Augment, make_augmentation
+from sb3_progpolicy.imitation.augmentation import Augment, make_augmentation, make_starts
 from sb3_progpolicy.imitation.conversion import make_program, rounded, to_program
 from sb3_progpolicy.imitation.decision_list import DecisionList
 from sb3_progpolicy.imitation.judge import Judge
@@ -33,9 +33,7 @@ _TOLERANCES = ((0.012, True), (0.004, True), (0.003, False), (0.001, False))
 _FINALISTS = 3
 _CHANGED = 0.02  # share of the actions, or mean distance, that rounding may change
 _RARE, _DROPS = 0.03, 5  # share of the states in which a rare branch acts; how many are tried without
-# A list whose loss is so many times the best one's is not looked at; less is allowed where episodes do not show all
-# that was learned.
-_NEAR, _NEAR_AUGMENTED, _LOSS = 2.0, 1.2, 0.01
+_NEAR, _LOSS = 2.0, 0.01  # a list whose loss is so many times the best one's, and more, is not looked at
 _SHORT = (7, 4, 2, 1)  # numbers of branches that are tried at the end
 _DIGITS = (2, 3, 4, 6)
 #: Inputs that are not read by default: beyond the training sizes they take values that were never seen.
@@ -108,8 +106,9 @@ def imitate(
     :param n_episodes: of each validation, on training variations; the last ones have twice as many
     :param env_kwargs: constructor arguments of the environment
     :param augment: makes states that were not visited, which the teacher labels too: a function from observations and
-        a generator to observations, or ``"taller_towers"`` for PandaStack. What was learned so was shown more than the
-        training variations; the metadata say so
+        a generator to observations, or ``"taller_towers"`` for PandaStack; ``"begun_towers"`` begins its episodes with
+        a tower of up to four blocks instead. What was learned so was shown more than the training variations; the
+        metadata say so
     :param callback: is called after each round
     :param checkpoint: file in which the state is kept after each round; one that exists is gone on from
     :return: the program; its metadata say that it was learned by imitation, and of whom
@@ -130,10 +129,11 @@ def imitate(
             f"n_timesteps={n_timesteps}, max_conditions={max_conditions}, n_episodes={n_episodes} are not accepted; "
             f"at least {n_shares * n_envs} (for n_envs={n_envs}), 0 and 1 are"
         )
-    with Pool(env_id, n_envs, env_kwargs, interaction) as pool:
+    begin = make_starts(augment)
+    with Pool(env_id, n_envs, env_kwargs, interaction, begin) as pool:
         run = _Run(pool, teacher, env_id, tasks, seed, max_conditions + 1, ignore, n_episodes, score_tolerance, augment)
         n_states = n_timesteps // (len(SHARES) + 1 if remembers else n_shares)
-        with Pool(env_id, run.n_rows(n_states), env_kwargs, interaction) as visited:
+        with Pool(env_id, run.n_rows(n_states), env_kwargs, interaction, begin) as visited:
             if remembers:
                 return run.run_with_memory(visited, n_states, callback)
             return run.run(visited, n_states, callback, checkpoint)
@@ -308,13 +308,12 @@ class _Run:
             self._offer(candidate)
         assert self.best is not None
         self.learner.raw = self.best[1]
-        factor = _NEAR if self.augmentation is None else _NEAR_AUGMENTED
-        self.loss_limit = factor * self.learner.loss_of(self.best[1]) + _LOSS
+        self.loss_limit = _NEAR * self.learner.loss_of(self.best[1]) + _LOSS
 
     def _make_short(self) -> None:
         """Go on with lists of fewer and fewer branches as long as their episodes are as good as the best ones."""
         assert self.best is not None
-        score, best = self.best
+        score, best = self._value(self.best), self.best[1]
         for n_branches in (number for number in _SHORT if number < best.n_branches):
             if not self._take_over(self.learner.short(n_branches), score):
                 return
@@ -322,7 +321,7 @@ class _Run:
     def _make_sparse(self) -> None:
         """Go on with the program of fewest inputs whose episodes are as good as the best ones."""
         assert self.best is not None
-        score, dense = self.best
+        score, dense = self._value(self.best), self.best[1]
         for tolerance, always_few in _TOLERANCES:
             if self._take_over(self.learner.sparse(dense, tolerance, always_few), score):
                 return
@@ -330,8 +329,7 @@ class _Run:
     def _drop_rare_branches(self) -> None:
         """Leave out branches that hardly ever act, one after another, as long as the episodes stay as good."""
         assert self.best is not None
-        score, _ = self.best
-        tries = 0
+        score, tries = self._value(self.best), 0
         while self.best[1].n_branches > 1:
             for index in self.learner.rare_branches(self.best[1], _RARE):
                 if tries == _DROPS:
@@ -347,17 +345,24 @@ class _Run:
         if self.learner.loss_of(candidate) > self.loss_limit:
             return False
         reached = self._score(candidate, score)
-        if not self.judge.as_good(reached, score):
+        if not self.judge.as_good(self._value((reached, candidate)), score):
             return False
         self.best, self.learner.raw, self.result = (reached, candidate), candidate, self.judge.last_result
         return True
 
+    def _value(self, scored: Scored) -> float:
+        """Return the score less the loss where states were labelled that no episode comes to, else the score."""
+        score, candidate = scored
+        return score if self.augmentation is None else score - self.learner.loss_of(candidate)
+
     def _offer(self, candidate: DecisionList, sparse: bool = False) -> None:
         """Keep a candidate if its episodes are better than the best so far."""
-        reached = self._score(candidate)
-        self.runners_up = sorted([*self.runners_up, (reached, candidate)], key=lambda scored: -scored[0])[:_FINALISTS]
-        if self.best is None or reached >= self.best[0] or (sparse and self.judge.as_good(reached, self.best[0])):
-            self.best, self.result = (reached, candidate), self.judge.last_result
+        offered = self._score(candidate), candidate
+        ranked = sorted([*self.runners_up, offered], key=self._value, reverse=True)
+        self.runners_up = ranked[:_FINALISTS]
+        value, least = self._value(offered), -np.inf if self.best is None else self._value(self.best)
+        if value >= least or (sparse and self.judge.as_good(value, least)):
+            self.best, self.result = offered, self.judge.last_result
 
     def _rounded(self) -> DecisionList:
         """Return the best list with as few digits as its episodes allow, its outputs in the unit of actions."""

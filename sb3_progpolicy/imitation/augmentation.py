@@ -1,8 +1,9 @@
-"""States that were not visited: changed copies of visited ones, which the teacher labels too."""
+"""What is learned from beyond the training variations: states that were not visited, or other starts."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -62,8 +63,40 @@ def taller_towers(names: Sequence[str]) -> Augment:
 AUGMENTATIONS: dict[str, Callable[[Sequence[str]], Augment]] = {"taller_towers": taller_towers}
 
 
+#: Begins an episode of an environment, by a seed and a variation, in another way than ``reset``; the observation.
+Begin = Callable[[Any, int, Mapping[str, Any]], Observations]
+_MOST_BEGUN = 4  # blocks; the gripper's first place is just above so many
+
+
+def begun_towers(env: Any, seed: int, variation: Mapping[str, Any]) -> Observations:
+    """Begin an episode of PandaStack with the blocks of a variation beside a tower of up to four others.
+
+    :param env: the environment
+    :param seed: of the episode
+    :param variation: with ``n_objects``, those that are still to be stacked
+    :raises ValueError: if it is another environment
+    """
+    if not hasattr(env.unwrapped, "begin_tower"):
+        raise ValueError("augment='begun_towers' is not accepted: only PandaStack has towers")
+    n_done = int(np.random.default_rng((seed, 1)).integers(_MOST_BEGUN + 1))
+    env.reset(seed=seed, options={**variation, "n_objects": variation.get("n_objects", 1) + n_done})
+    return np.asarray(env.unwrapped.begin_tower(n_done))
+
+
+#: Names of the ready ones.
+STARTS: dict[str, Begin] = {"begun_towers": begun_towers}
+
+
+def make_starts(given: str | Augment | None) -> Begin | None:
+    """Return what begins episodes in another way, if the augmentation of that name is one.
+
+    :param given: what :func:`~sb3_progpolicy.imitate` is given
+    """
+    return STARTS.get(given) if isinstance(given, str) else None
+
+
 def make_augmentation(given: str | Augment | None, names: Sequence[str]) -> Augment | None:
-    """Return an augmentation.
+    """Return an augmentation of visited states, ``None`` for none.
 
     :param given: a name, a function, or ``None`` for none
     :param names: of the numbers of an observation
@@ -71,6 +104,8 @@ def make_augmentation(given: str | Augment | None, names: Sequence[str]) -> Augm
     """
     if not isinstance(given, str):
         return given
+    if given in STARTS:
+        return None
     if given not in AUGMENTATIONS:
-        raise unknown("augmentation", given, AUGMENTATIONS)
+        raise unknown("augmentation", given, [*AUGMENTATIONS, *STARTS])
     return AUGMENTATIONS[given](names)

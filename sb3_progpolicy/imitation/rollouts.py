@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_progpolicy.evaluation import spec_of
-from sb3_progpolicy.imitation.augmentation import Augment
+from sb3_progpolicy.imitation.augmentation import Augment, Begin
 from sb3_progpolicy.imitation.teachers import Observations, PlannerTeacher, Situation, Teacher, join_history
 from sb3_progpolicy.programs.interpreter import ProgramRunner
 from sb3_progpolicy.programs.syntax import ProgramData
@@ -34,13 +34,19 @@ class Pool:
     :param n_envs: how many
     :param env_kwargs: constructor arguments
     :param interaction: whether a student reads the previous action, reward and done flag too
+    :param begin: begins an episode in another way than ``reset``
     :raises ValueError: if the id is not known or the observations are not accepted
     """
 
     def __init__(
-        self, env_id: str, n_envs: int, env_kwargs: Mapping[str, Any] | None = None, interaction: bool = False
+        self,
+        env_id: str,
+        n_envs: int,
+        env_kwargs: Mapping[str, Any] | None = None,
+        interaction: bool = False,
+        begin: Begin | None = None,
     ) -> None:
-        self.interaction = interaction
+        self.interaction, self._begin = interaction, begin
         spec = spec_of(env_id)
         self.envs: list[Any] = [gym.make(spec.id, **(env_kwargs or {})) for _ in range(n_envs)]
         space = check_observation_space(self.envs[0].observation_space)
@@ -66,7 +72,10 @@ class Pool:
 
     def reset(self, row: int, seed: int, variation: Mapping[str, Any]) -> None:
         """Begin an episode."""
-        self.observations[row] = self.envs[row].reset(seed=seed, options=dict(variation) or None)[0]
+        if self._begin is not None:
+            self.observations[row] = self._begin(self.envs[row], seed, variation)
+        else:
+            self.observations[row] = self.envs[row].reset(seed=seed, options=dict(variation) or None)[0]
 
     def situation(self, rows: Sequence[int] | None = None) -> Situation:
         """Return what a teacher may look at."""

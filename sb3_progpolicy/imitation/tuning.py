@@ -22,7 +22,7 @@ def fine_tune(
     n_steps: int,
     seed: int,
     temperatures: tuple[float, float] = (0.3, 0.03),
-    learning_rate: float = 3e-3,
+    learning_rate: float = 1e-2,
     batch_size: int = 512,
     keep_zeros: bool = False,
 ) -> DecisionList:

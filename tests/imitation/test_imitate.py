@@ -16,7 +16,7 @@ from progpolicy_envs.panda import PandaStackEnv
 from sb3_progpolicy import compare_with_teacher, evaluate_program, imitate, load_pretrained
 from sb3_progpolicy.cli import run
 from sb3_progpolicy.imitation import algorithm, make_teacher
-from sb3_progpolicy.imitation.augmentation import taller_towers
+from sb3_progpolicy.imitation.augmentation import begun_towers, taller_towers
 from sb3_progpolicy.imitation.decision_list import DecisionList
 from sb3_progpolicy.imitation.learner import Settings
 from sb3_progpolicy.imitation.rollouts import STALL_WEIGHT, Collector, Pool, play
@@ -91,6 +91,30 @@ def test_taller_towers_are_labelled_by_the_scripted_controller():
         imitate("planner", "Stacking-v0", augment="taller_towers")
     with pytest.raises(ValueError, match="needs more than an observation"):
         imitate("planner", "Stacking-v0", augment=lambda observations, rng: observations, **SMALL)
+
+
+def test_begun_towers_are_finished_and_the_blocks_of_the_variation_are_not():
+    with Pool("PandaStack-v0", 12, begin=begun_towers) as pool:
+        done = []
+        for row in range(12):
+            pool.reset(row, 100 + row, {"n_objects": 2})
+            finished = pool.envs[row].unwrapped.task.finished
+            assert finished[-2:] == [False, False]
+            assert all(finished[:-2])
+            done.append(len(finished) - 2)
+        assert set(done) == {0, 1, 2, 3, 4}
+        heights = pool.observations[:, list(PandaStackEnv.observation_names).index("target_z")]
+        np.testing.assert_allclose(heights, 0.02 + 0.04 * np.array(done), atol=1e-6)
+        first = pool.observations[0].copy()
+        pool.reset(0, 100, {"n_objects": 2})
+        np.testing.assert_array_equal(pool.observations[0], first)
+        pool.reset(0, 101, {"n_objects": 1})
+        with pytest.raises(ValueError, match="n_done=7 is not accepted"):
+            pool.envs[0].unwrapped.begin_tower(7)
+    with pytest.raises(ValueError, match="only PandaStack has towers"):
+        imitate("planner", "PandaPush-v0", augment="begun_towers", **SMALL)
+    with pytest.raises(ValueError, match="begun_towers"):
+        imitate("planner", "PandaPush-v0", augment="begun_tower", **SMALL)
 
 
 def test_same_seed_gives_the_same_program(balanced):
