@@ -8,9 +8,9 @@ Each seed imitates from scratch, on training variations alone. Its program is th
 were not used before; with --final on the validation and the unseen ones too, which nothing is chosen by. The teacher's
 own results are the rows of the seed "teacher".
 
-Writes ``benchmarks/results/<name>.csv``, in which each row names its commit, a ``.json`` with command, commit and
-versions, and the programs as ``benchmarks/results/programs/<name>_<seed>.json``. What is there for the same arguments
-is not done again, and a seed that was interrupted goes on from its last round, kept in ``runs/``.
+Writes ``benchmarks/results/<name>.csv``, in which each row names the commit that learned it, a ``.json`` with command,
+commit and versions, and the programs as ``benchmarks/results/programs/<name>_<seed>.json``. What is there for the same
+arguments is not done again, and a seed that was interrupted goes on from its last round, kept in ``runs/``.
 """
 
 from __future__ import annotations
@@ -45,7 +45,13 @@ PROGRAMS = RESULTS / "programs"
 
 
 def learn(teacher: Any, env_id: str, seed: int, folder: Path, arguments: dict[str, Any]) -> Program:
-    """Return the program of one seed; its metadata hold the seconds that it took, those of an interrupted run, too."""
+    """Return the program of one seed, learned now or by an earlier run with the same arguments.
+
+    Its metadata hold the arguments, the commit and the seconds that it took, those of an interrupted run, too.
+    """
+    path, study = PROGRAMS / f"{folder.name}_{seed}.json", json.loads(json.dumps(arguments))
+    if path.exists() and (program := Program.load(path)).metadata.get("study") == study:
+        return program
     folder.mkdir(parents=True, exist_ok=True)
     state, clock = folder / f"seed_{seed}.state.npz", folder / f"seed_{seed}.seconds"
     before = float(clock.read_text()) if state.exists() and clock.exists() else 0.0
@@ -58,7 +64,10 @@ def learn(teacher: Any, env_id: str, seed: int, folder: Path, arguments: dict[st
     seconds = round(before + time.process_time() - started, 1)
     state.unlink()
     clock.unlink()
-    return dataclasses.replace(program, metadata={**program.metadata, "cpu_seconds": seconds})
+    about = {"cpu_seconds": seconds, "study": study, "commit": commit()}
+    program = dataclasses.replace(program, metadata={**program.metadata, **about})
+    program.save(path)
+    return program
 
 
 Wanted = list[tuple[str, Any]]
@@ -108,7 +117,7 @@ def rows_of(
 ) -> list[dict[str, Any]]:
     """Run the program, or the teacher if there is none, on the variations."""
     rows: list[dict[str, Any]] = []
-    about = {"seed": seed, **_about(program), "commit": commit()}
+    about = {"seed": seed, "commit": commit(), **_about(program)}
     with Pool(env_id, min(episodes, 25), interaction=program is not None and program.interaction) as pool:
         judge = make_teacher(teacher, pool.envs[0])
         act = None if program is None else program_act(program, len(pool))
@@ -143,6 +152,7 @@ def _about(program: Program | None) -> dict[str, Any]:
         "n_lines": sum(bool(line) for line in str(program).splitlines()),
         "cpu_seconds": program.metadata.get("cpu_seconds", ""),
         "learned_by": learned_by(program),
+        "commit": program.metadata.get("commit", ""),
     }
 
 
@@ -198,8 +208,6 @@ def main() -> None:
     for seed in track(["teacher", *map(str, range(options.seeds))], "Seeds"):
         if seed not in known:
             program = None if seed == "teacher" else learn(teacher, options.env, int(seed), folder, arguments)
-            if program is not None:
-                program.save(PROGRAMS / f"{name}_{seed}.json")
             known[seed] = rows_of(seed, options.env, teacher, program, options.episodes, wanted)
         rows += known[seed]
         write_results(name, COLUMNS, rows, arguments)
