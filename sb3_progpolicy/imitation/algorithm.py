@@ -27,7 +27,7 @@ from sb3_progpolicy.spaces import action_spec
 
 #: Share of the teacher in each round; 0 in all later ones.
 TEACHER_SHARES = (1.0, 0.6, 0.4, 0.3, 0.2, 0.1)
-N_ROUNDS, N_SPARSE_ROUNDS = 9, 2
+N_ROUNDS, N_SPARSE_ROUNDS = 9, 3
 # Of the mean loss, and whether few inputs matter more; the sparsest program first.
 _TOLERANCES = ((0.012, True), (0.004, True), (0.003, False), (0.001, False))
 _FINALISTS = 3
@@ -281,7 +281,7 @@ class _Run:
         learner = self.learner
         self.collector.begin()
         share = TEACHER_SHARES[number] if number < len(TEACHER_SHARES) else 0.0
-        student = None if learner.raw is None else self._act(learner.raw)
+        student = None if learner.raw is None else self.codec.act_of(learner.raw)
         visits = self.collector.collect(n_steps * (1 if number else 2), student, share)
         targets = self.codec.encode(visits.actions) if visits.good is None else visits.good.astype(np.float64)
         learner.add(visits.inputs, targets, visits.weights)
@@ -296,9 +296,10 @@ class _Run:
             self._choose_finally()
             self._make_short()
             self._make_sparse()
-            self._drop_rare_branches()
             return
         self._offer(learner.refit_sparse(), sparse=True)
+        if number == N_ROUNDS + N_SPARSE_ROUNDS - 1:
+            self._drop_rare_branches()
 
     def _choose_finally(self) -> None:
         """Let the best few play more episodes, which none of them was chosen by."""
@@ -315,40 +316,54 @@ class _Run:
         assert self.best is not None
         score, best = self._value(self.best), self.best[1]
         for n_branches in (number for number in _SHORT if number < best.n_branches):
-            if not self._take_over(self.learner.short(n_branches), score):
+            if self._take_over(self.learner.short(n_branches), score) is not None:
                 return
 
     def _make_sparse(self) -> None:
-        """Go on with the program of fewest inputs whose episodes are as good as the best ones."""
+        """Go on with the program of fewest inputs whose episodes are as good as the best ones.
+
+        If there is none, the rounds that follow are those of the best one of few inputs, whose mistakes they visit.
+        """
         assert self.best is not None
         score, dense = self._value(self.best), self.best[1]
+        few = []
         for tolerance, always_few in _TOLERANCES:
-            if self._take_over(self.learner.sparse(dense, tolerance, always_few), score):
+            sparse = self.learner.sparse(dense, tolerance, always_few)
+            reached = self._take_over(sparse, score)
+            if reached is None:
                 return
+            if always_few:
+                few.append((reached, sparse))
+        self.learner.raw = max(few, key=lambda scored: scored[0])[1]
 
     def _drop_rare_branches(self) -> None:
         """Leave out branches that hardly ever act, one after another, as long as the episodes stay as good."""
         assert self.best is not None
         score, tries = self._value(self.best), 0
+        self.loss_limit = _NEAR * self.learner.loss_of(self.best[1]) + _LOSS
         while self.best[1].n_branches > 1:
             for index in self.learner.rare_branches(self.best[1], _RARE):
                 if tries == _DROPS:
                     return
                 tries += 1
-                if self._take_over(self.learner.without(self.best[1], index), score):
+                if self._take_over(self.learner.without(self.best[1], index), score) is None:
                     break
             else:
                 return
 
-    def _take_over(self, candidate: DecisionList, score: float) -> bool:
-        """Go on with a smaller list if its loss is not far from the best one's and its episodes are as good."""
+    def _take_over(self, candidate: DecisionList, score: float) -> float | None:
+        """Go on with a smaller list if its loss is not far from the best one's and its episodes are as good.
+
+        :return: ``None``, or, if it is not so, its value
+        """
         if self.learner.loss_of(candidate) > self.loss_limit:
-            return False
+            return -np.inf
         reached = self._score(candidate, score)
-        if not self.judge.as_good(self._value((reached, candidate)), score):
-            return False
+        value = self._value((reached, candidate))
+        if not self.judge.as_good(value, score):
+            return value
         self.best, self.learner.raw, self.result = (reached, candidate), candidate, self.judge.last_result
-        return True
+        return None
 
     def _value(self, scored: Scored) -> float:
         """Return the score less the loss where states were labelled that no episode comes to, else the score."""
@@ -370,27 +385,19 @@ class _Run:
         score, best = self.best
         raw = DecisionList(best.conditions, self.codec.to_action_units(best.controllers))
         states = self.learner.observations[:: max(1, self.learner.n_states // 2000)]
-        exact = self._act(best)(states)
+        exact = self.codec.act_of(best)(states)
         for digits in _DIGITS:
             candidate = rounded(raw, digits, self.codec.unit)
             program = self._program(candidate)
             changed = self.codec.distance(program_act(program, len(states))(states), exact).mean()
-            if changed <= _CHANGED and self.judge.as_good(self._program_score(program, score), score, share=0.5):
+            if changed > _CHANGED:
+                continue
+            if self.judge.as_good(self.judge.score(program_act(program, len(self.pool)), score), score, share=0.5):
                 return candidate
         return raw
 
     def _score(self, raw: DecisionList, needed: float | None = None) -> float:
-        return self.judge.score(self._act(raw), needed)
-
-    def _program_score(self, program: Program, needed: float) -> float:
-        return self.judge.score(program_act(program, len(self.pool)), needed)
-
-    def _act(self, raw: DecisionList) -> Any:
-        def act(inputs: np.ndarray) -> np.ndarray:
-            with_constant = np.column_stack([inputs.astype(np.float64), np.ones(len(inputs))])
-            return self.codec.decode(raw.outputs(with_constant))
-
-        return act
+        return self.judge.score(self.codec.act_of(raw), needed)
 
     def _progress(self, number: int, total: int) -> Imitation:
         assert self.learner.raw is not None
