@@ -192,6 +192,7 @@ def main() -> None:
     parser.add_argument("--name", help="name of the result files; that of the domain by default")
     options = parser.parse_args()
     th.set_num_threads(1)
+    commit()  # of the code that is loaded now
     spec_of(options.env)
     PROGRAMS.mkdir(parents=True, exist_ok=True)
     name = options.name or f"imitation_{options.env.rpartition('-')[0].lower()}"

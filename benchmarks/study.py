@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -54,8 +55,9 @@ def train(env_id: str, seed: int, folder: Path, overrides: dict[str, Any]) -> Pr
     return program
 
 
+@cache
 def commit() -> str:
-    """Return the commit that is checked out."""
+    """Return the commit that was checked out when this was first asked, before a long study."""
     return subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
 
 
