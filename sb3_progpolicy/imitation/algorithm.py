@@ -175,7 +175,8 @@ class _Run:
         self.learner = Learner(self.codec, readable, Settings(max_branches, seed))
         self.best: Scored | None = None
         self.runners_up: list[Scored] = []
-        self.loss_limit = np.inf
+        #: Value of the best list of all, before it was made smaller: what smaller ones are held to.
+        self.reference = -np.inf
         self.n_labelled = 0
         self.result: dict[str, float] = {}
 
@@ -264,6 +265,7 @@ class _Run:
             best=self.best,
             runners_up=tuple(self.runners_up),
             result=self.result,
+            reference=self.reference,
         )
 
     def _restore(self, state: State) -> int:
@@ -274,7 +276,7 @@ class _Run:
         collector.next_seed = state.next_seed
         learner.observations, learner.targets, learner.weights = state.observations, state.targets, state.weights
         learner.raw, self.best, self.runners_up = state.present, state.best, list(state.runners_up)
-        self.result = dict(state.result)
+        self.result, self.reference = dict(state.result), state.reference
         return state.number
 
     def _round(self, number: int, n_steps: int) -> None:
@@ -308,15 +310,14 @@ class _Run:
         for _, candidate in list(self.runners_up):
             self._offer(candidate)
         assert self.best is not None
-        self.learner.raw = self.best[1]
-        self.loss_limit = _NEAR * self.learner.loss_of(self.best[1]) + _LOSS
+        self.learner.raw, self.reference = self.best[1], self._value(self.best)
 
     def _make_short(self) -> None:
         """Go on with lists of fewer and fewer branches as long as their episodes are as good as the best ones."""
         assert self.best is not None
-        score, best = self._value(self.best), self.best[1]
-        for n_branches in (number for number in _SHORT if number < best.n_branches):
-            if self._take_over(self.learner.short(n_branches), score) is not None:
+        most = self.best[1].n_branches
+        for n_branches in (number for number in _SHORT if number < most):
+            if self._take_over(self.learner.short(n_branches)) is not None:
                 return
 
     def _make_sparse(self) -> None:
@@ -325,11 +326,10 @@ class _Run:
         If there is none, the rounds that follow are those of the best one of few inputs, whose mistakes they visit.
         """
         assert self.best is not None
-        score, dense = self._value(self.best), self.best[1]
-        few = []
+        dense, few = self.best[1], []
         for tolerance, always_few in _TOLERANCES:
             sparse = self.learner.sparse(dense, tolerance, always_few)
-            reached = self._take_over(sparse, score)
+            reached = self._take_over(sparse)
             if reached is None:
                 return
             if always_few:
@@ -339,28 +339,28 @@ class _Run:
     def _drop_rare_branches(self) -> None:
         """Leave out branches that hardly ever act, one after another, as long as the episodes stay as good."""
         assert self.best is not None
-        score, tries = self._value(self.best), 0
-        self.loss_limit = _NEAR * self.learner.loss_of(self.best[1]) + _LOSS
+        tries = 0
         while self.best[1].n_branches > 1:
             for index in self.learner.rare_branches(self.best[1], _RARE):
                 if tries == _DROPS:
                     return
                 tries += 1
-                if self._take_over(self.learner.without(self.best[1], index), score) is None:
+                if self._take_over(self.learner.without(self.best[1], index)) is None:
                     break
             else:
                 return
 
-    def _take_over(self, candidate: DecisionList, score: float) -> float | None:
+    def _take_over(self, candidate: DecisionList) -> float | None:
         """Go on with a smaller list if its loss is not far from the best one's and its episodes are as good.
 
         :return: ``None``, or, if it is not so, its value
         """
-        if self.learner.loss_of(candidate) > self.loss_limit:
+        assert self.best is not None
+        if self.learner.loss_of(candidate) > _NEAR * self.learner.loss_of(self.best[1]) + _LOSS:
             return -np.inf
-        reached = self._score(candidate, score)
+        reached = self._score(candidate, self.best[0])
         value = self._value((reached, candidate))
-        if not self.judge.as_good(value, score):
+        if not self.judge.as_good(value, self.reference):
             return value
         self.best, self.learner.raw, self.result = (reached, candidate), candidate, self.judge.last_result
         return None
@@ -376,7 +376,7 @@ class _Run:
         ranked = sorted([*self.runners_up, offered], key=self._value, reverse=True)
         self.runners_up = ranked[:_FINALISTS]
         value, least = self._value(offered), -np.inf if self.best is None else self._value(self.best)
-        if value >= least or (sparse and self.judge.as_good(value, least)):
+        if value >= least or (sparse and self.judge.as_good(value, self.reference)):
             self.best, self.result = offered, self.judge.last_result
 
     def _rounded(self) -> DecisionList:

@@ -31,6 +31,7 @@ class State:
     :param best: score and list; ``None`` before the first validation
     :param runners_up: the best few with their scores
     :param result: of the best list in its validation
+    :param reference: value of the best list before it was made smaller
     """
 
     number: int
@@ -43,6 +44,7 @@ class State:
     best: Scored | None
     runners_up: tuple[Scored, ...]
     result: Mapping[str, float]
+    reference: float
 
 
 def save_state(path: Path, origin: Mapping[str, Any], state: State) -> None:
@@ -69,6 +71,7 @@ def save_state(path: Path, origin: Mapping[str, Any], state: State) -> None:
         "has_best": state.best is not None,
         "scores": [score for score, _ in scored],
         "result": dict(state.result),
+        "reference": state.reference,
     }
     content = io.BytesIO()
     np.savez_compressed(
@@ -106,6 +109,7 @@ def load_state(path: Path, origin: Mapping[str, Any]) -> State:
             best=scored[0] if about["has_best"] else None,
             runners_up=tuple(scored[int(about["has_best"]) :]),
             result=about["result"],
+            reference=about["reference"],
         )
     except (OSError, EOFError, ValueError, KeyError, TypeError, IndexError) as error:
         raise ValueError(f"{path} is not the state of an imitation: {error}; remove it to begin anew") from None
