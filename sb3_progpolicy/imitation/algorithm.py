@@ -33,7 +33,7 @@ _TOLERANCES = ((0.012, True), (0.004, True), (0.003, False), (0.001, False))
 _FINALISTS = 3
 _CHANGED = 0.02  # share of the actions, or mean distance, that rounding may change
 _RARE, _DROPS = 0.03, 5  # share of the states in which a rare branch acts; how many are tried without
-_NEAR, _LOSS = 2.0, 0.01  # a list whose loss is so many times the best one's, and more, is not looked at
+_NEAR, _LOSS = 1.3, 0.01  # a list whose loss is so many times the best one's, and more, is not looked at
 _SHORT = (7, 4, 2, 1)  # numbers of branches that are tried at the end
 _DIGITS = (2, 3, 4, 6)
 #: Inputs that are not read by default: beyond the training sizes they take values that were never seen.
