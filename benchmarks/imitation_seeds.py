@@ -2,18 +2,23 @@
 
     python benchmarks/imitation_seeds.py --env PandaPush-v0 [--seeds 10] [--episodes 100] [--final]
     python benchmarks/imitation_seeds.py --env CartPole-v1 --ppo 60000
+    python benchmarks/imitation_seeds.py --env HikingEgo-v0 --interaction --set n_stars=1-4 layout=random
 
 Each seed imitates from scratch, on training variations alone. Its program is then run crisp on these, on starts that
 were not used before; with --final on the validation and the unseen ones too, which nothing is chosen by. The teacher's
-own results are the rows of the seed "teacher". A finished seed is kept in ``runs/``: an interrupted study goes on.
+own results are the rows of the seed "teacher".
 
-Writes ``benchmarks/results/<name>.csv`` and a ``.json`` with command, commit and versions.
+Writes ``benchmarks/results/<name>.csv``, in which each row names the commit that learned it, a ``.json`` with command,
+commit and versions, and the programs as ``benchmarks/results/programs/<name>_<seed>.json``. What is there for the same
+arguments is not done again, and a seed that was interrupted goes on from its last round, kept in ``runs/``.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import dataclasses
+import json
 import time
 from pathlib import Path
 from typing import Any
@@ -21,60 +26,119 @@ from typing import Any
 import numpy as np
 import torch as th
 from rich.progress import track
-from study import write_results
+from study import RESULTS, commit, write_results
 
 from progpolicy_envs import find_domain
+from sb3_progpolicy.cli.parsing import parse_variations
 from sb3_progpolicy.evaluation import spec_of
-from sb3_progpolicy.imitation import imitate, make_teacher
+from sb3_progpolicy.imitation import Imitation, imitate, make_teacher
 from sb3_progpolicy.imitation.rollouts import Episodes, Pool, play, program_act
 from sb3_progpolicy.programs import Program
+from sb3_progpolicy.programs.files import write_atomically
 
 COLUMNS = (
     *("seed", "set", "variation", "episodes", "success_rate", "steps_mean", "return_mean"),
-    *("n_conditions", "n_numbers", "n_lines", "cpu_seconds"),
+    *("n_conditions", "n_numbers", "n_lines", "cpu_seconds", "learned_by", "commit"),
 )
 EVALUATION_SEED = 10_000
+PROGRAMS = RESULTS / "programs"
 
 
 def learn(teacher: Any, env_id: str, seed: int, folder: Path, arguments: dict[str, Any]) -> Program:
-    """Return the program of one seed, learned now or read from ``folder``; its metadata hold the seconds it took."""
-    path = folder / f"seed_{seed}.json"
-    if path.exists():
-        return Program.load(path)
+    """Return the program of one seed, learned now or by an earlier run with the same arguments.
+
+    Its metadata hold the arguments, the commit and the seconds that it took, those of an interrupted run, too.
+    """
+    path, study = PROGRAMS / f"{folder.name}_{seed}.json", json.loads(json.dumps(arguments))
+    if path.exists() and (program := Program.load(path)).metadata.get("study") == study:
+        return program
     folder.mkdir(parents=True, exist_ok=True)
+    state, clock = folder / f"seed_{seed}.state.npz", folder / f"seed_{seed}.seconds"
+    before = float(clock.read_text()) if state.exists() and clock.exists() else 0.0
     started = time.process_time()
-    program = imitate(teacher, env_id, seed=seed, **arguments)
-    seconds = round(time.process_time() - started, 1)
-    program = dataclasses.replace(program, metadata={**program.metadata, "cpu_seconds": seconds})
+
+    def after_round(_: Imitation) -> None:
+        write_atomically(clock, str(before + time.process_time() - started))
+
+    program = imitate(teacher, env_id, seed=seed, checkpoint=state, callback=after_round, **arguments)
+    seconds = round(before + time.process_time() - started, 1)
+    state.unlink()
+    clock.unlink()
+    about = {"cpu_seconds": seconds, "study": study, "commit": commit()}
+    program = dataclasses.replace(program, metadata={**program.metadata, **about})
     program.save(path)
     return program
 
 
-def rows_of(seed: Any, env_id: str, teacher: Any, program: Program | None, episodes: int, final: bool) -> list[Any]:
+Wanted = list[tuple[str, Any]]
+
+
+def wanted_variations(env_id: str, final: bool, sizes: list[int] | None) -> Wanted:
+    """Return the set and the variation of each row, of all sizes or of some."""
+    domain = find_domain(env_id)
+    if domain is None:
+        return [("train", {})]
+    parts = {"train": domain.train, **({"validation": domain.validation, "unseen": domain.unseen} if final else {})}
+    return [
+        (kind, variation)
+        for kind, variations in parts.items()
+        for variation in variations
+        if sizes is None or variation[domain.size] in sizes
+    ]
+
+
+def known_rows(name: str, arguments: dict[str, Any], episodes: int, wanted: Wanted) -> dict[str, list[dict[str, Any]]]:
+    """Return the rows that an earlier run of the same study has left, by seed."""
+    table, origin = RESULTS / f"{name}.csv", RESULTS / f"{name}.json"
+    if not (table.exists() and origin.exists()):
+        return {}
+    if json.loads(origin.read_text())["overrides"] != json.loads(json.dumps(arguments)):
+        return {}
+    with table.open(newline="") as lines:
+        rows: list[dict[str, Any]] = list(csv.DictReader(lines))
+    if not rows or tuple(rows[0]) != COLUMNS:
+        return {}
+    found: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        for column in ("success_rate", "steps_mean", "return_mean"):
+            row[column] = float(row[column]) if row[column] else ""
+        found.setdefault(row["seed"], []).append(row)
+    whole = [(kind, _named(variation)) for kind, variation in wanted]
+    return {
+        seed: own
+        for seed, own in found.items()
+        if whole == [(row["set"], row["variation"]) for row in own]
+        and all(row["episodes"] == str(episodes) for row in own)
+    }
+
+
+def rows_of(
+    seed: Any, env_id: str, teacher: Any, program: Program | None, episodes: int, wanted: Wanted
+) -> list[dict[str, Any]]:
     """Run the program, or the teacher if there is none, on the variations."""
-    domain, rows = find_domain(env_id), []
-    sets = [("train", domain.train if domain is not None else ({},))]
-    if domain is not None and final:
-        sets += [("validation", domain.validation), ("unseen", domain.unseen)]
-    pool = Pool(env_id, min(episodes, 24), interaction=program is not None and program.interaction)
-    judge = make_teacher(teacher, pool.envs[0])
-    act = None if program is None else program_act(program, len(pool))
-    for kind, variations in sets:
-        for variation in variations:
+    rows: list[dict[str, Any]] = []
+    about = {"seed": seed, "commit": commit(), **_about(program)}
+    with Pool(env_id, min(episodes, 25), interaction=program is not None and program.interaction) as pool:
+        judge = make_teacher(teacher, pool.envs[0])
+        act = None if program is None else program_act(program, len(pool))
+        for kind, variation in wanted:
             played = play(pool, [variation], episodes, EVALUATION_SEED, act, judge)
-            rows.append({"seed": seed, "set": kind, **_row(variation, played), **_about(program)})
-    pool.close()
+            rows.append({"set": kind, **_row(variation, played), **about})
     return rows
 
 
 def _row(variation: Any, played: Episodes) -> dict[str, Any]:
     return {
-        "variation": ", ".join(f"{name}={value}" for name, value in variation.items()),
+        "variation": _named(variation),
         "episodes": len(played.returns),
         "success_rate": float(played.successes.mean()) if len(played.successes) else "",
         "steps_mean": round(float(played.steps.mean()), 2),
         "return_mean": round(float(played.returns.mean()), 3),
     }
+
+
+def _named(variation: Any) -> str:
+    return ", ".join(f"{name}={value}" for name, value in variation.items())
 
 
 def _about(program: Program | None) -> dict[str, Any]:
@@ -87,7 +151,15 @@ def _about(program: Program | None) -> dict[str, Any]:
         "n_numbers": count_numbers(program),
         "n_lines": sum(bool(line) for line in str(program).splitlines()),
         "cpu_seconds": program.metadata.get("cpu_seconds", ""),
+        "learned_by": learned_by(program),
+        "commit": program.metadata.get("commit", ""),
     }
+
+
+def learned_by(program: Program) -> str:
+    """Return how a program was learned, and what it was shown beyond the training variations."""
+    augmentation = program.metadata.get("augment")
+    return program.learned_by + (f", {augmentation}" if augmentation else "")
 
 
 def trained_ppo(env_id: str, n_timesteps: int, folder: Path) -> Any:
@@ -112,21 +184,33 @@ def main() -> None:
     parser.add_argument("--n-timesteps", type=int, default=24_000, help="states to label")
     parser.add_argument("--max-conditions", type=int, default=11, help="of the program at most")
     parser.add_argument("--interaction", action="store_true", help="read the previous action, reward and done flag")
-    parser.add_argument("--augment", help="label states that were not visited, too: taller_towers")
+    parser.add_argument("--set", nargs="+", help="variations to learn on, as name=value; by default the training ones")
+    parser.add_argument("--augment", help="more than the training variations: taller_towers or begun_towers")
     parser.add_argument("--ppo", type=int, help="imitate a network that PPO has trained for so many steps")
     parser.add_argument("--final", action="store_true", help="look at the validation and the unseen variations, too")
+    parser.add_argument("--sizes", type=int, nargs="+", help="sizes to run on; by default all")
     parser.add_argument("--name", help="name of the result files; that of the domain by default")
     options = parser.parse_args()
     th.set_num_threads(1)
+    commit()  # of the code that is loaded now
     spec_of(options.env)
+    PROGRAMS.mkdir(parents=True, exist_ok=True)
     name = options.name or f"imitation_{options.env.rpartition('-')[0].lower()}"
     folder = Path("runs") / name
-    arguments = {key: getattr(options, key) for key in ("n_timesteps", "max_conditions", "augment", "interaction")}
+    arguments: dict[str, Any] = {
+        key: getattr(options, key) for key in ("n_timesteps", "max_conditions", "augment", "interaction")
+    }
+    if options.set:
+        arguments["tasks"] = parse_variations(options.set)
     teacher = trained_ppo(options.env, options.ppo, folder) if options.ppo else "planner"
-    rows = rows_of("teacher", options.env, teacher, None, options.episodes, options.final)
-    for seed in track(range(options.seeds), "Seeds"):
-        program = learn(teacher, options.env, seed, folder, arguments)
-        rows += rows_of(seed, options.env, teacher, program, options.episodes, options.final)
+    wanted = wanted_variations(options.env, options.final, options.sizes)
+    known = known_rows(name, arguments, options.episodes, wanted)
+    rows: list[dict[str, Any]] = []
+    for seed in track(["teacher", *map(str, range(options.seeds))], "Seeds"):
+        if seed not in known:
+            program = None if seed == "teacher" else learn(teacher, options.env, int(seed), folder, arguments)
+            known[seed] = rows_of(seed, options.env, teacher, program, options.episodes, wanted)
+        rows += known[seed]
         write_results(name, COLUMNS, rows, arguments)
     for variation in dict.fromkeys(row["variation"] for row in rows):
         print(_sentence(variation, [row for row in rows if row["variation"] == variation]))

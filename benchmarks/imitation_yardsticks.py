@@ -18,24 +18,23 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from imitation_seeds import EVALUATION_SEED, _row
+from imitation_seeds import EVALUATION_SEED, _row, wanted_variations
 from study import write_results
 
 from progpolicy_envs import find_domain
 from sb3_progpolicy.imitation import make_teacher
 from sb3_progpolicy.imitation.actions import ActionCodec
-from sb3_progpolicy.imitation.algorithm import (
-    N_ROUNDS,
-    N_SPARSE_ROUNDS,
-    TEACHER_SHARES,
-    names_of,
-    training_variations,
-)
+from sb3_progpolicy.imitation.algorithm import N_ROUNDS, N_SPARSE_ROUNDS, TEACHER_SHARES
+from sb3_progpolicy.imitation.augmentation import make_augmentation, make_starts
 from sb3_progpolicy.imitation.decision_list import Scaler
 from sb3_progpolicy.imitation.rollouts import Act, Collector, Pool, play
+from sb3_progpolicy.imitation.tasks import names_of, training_variations
 from sb3_progpolicy.spaces import action_spec
 
-COLUMNS = ("student", "set", "variation", "episodes", "success_rate", "steps_mean", "return_mean", "cpu_seconds")
+COLUMNS = (
+    *("student", "learned_by", "set", "variation", "episodes", "success_rate", "steps_mean", "return_mean"),
+    *("cpu_seconds",),
+)
 _N_ENVS = 24
 
 
@@ -51,14 +50,17 @@ def students(n_branches: int, seed: int) -> dict[str, Callable[[], Any]]:
     }
 
 
-def learn(make: Callable[[], Any], pool: Pool, env_id: str, n_timesteps: int, seed: int) -> Act:
+def learn(
+    make: Callable[[], Any], pool: Pool, env_id: str, n_timesteps: int, seed: int, augment: str | None = None
+) -> Act:
     """Return the student after the rounds of DAgger that a program has, on all inputs but ``left``."""
     env: Any = pool.envs[0]
     spec = action_spec(env.action_space)
     inputs, outputs = names_of(env, spec.n_outputs, interaction=False)
     codec = ActionCodec(spec, outputs)
     readable = np.array([name != "left" for name in inputs])
-    collector = Collector(pool, make_teacher("planner", env), *training_variations(env_id, None), seed)
+    augmentation = make_augmentation(augment, inputs)
+    collector = Collector(pool, make_teacher("planner", env), *training_variations(env_id, None), seed, augmentation)
     collector.begin()
     n_rounds = N_ROUNDS + N_SPARSE_ROUNDS
     n_steps = n_timesteps // ((n_rounds + 1) * len(pool))
@@ -89,26 +91,31 @@ def main() -> None:
     parser.add_argument("--branches", type=int, default=9, help="leaves of the small tree")
     parser.add_argument("--n-timesteps", type=int, default=24_000, help="states to label")
     parser.add_argument("--episodes", type=int, default=100, help="episodes on each variation")
+    parser.add_argument("--augment", help="more than the training variations: taller_towers or begun_towers")
     parser.add_argument("--seed", type=int, default=0, help="of all draws")
+    parser.add_argument("--sizes", type=int, nargs="+", help="sizes to run on; by default all")
     parser.add_argument("--final", action="store_true", help="look at the unseen variations, too")
     options = parser.parse_args()
-    domain = find_domain(options.env)
-    assert domain is not None, f"{options.env} has no planner"
-    sets = [("train", domain.train), *([("unseen", domain.unseen)] if options.final else [])]
+    assert find_domain(options.env) is not None, f"{options.env} has no planner"
+    wanted = wanted_variations(options.env, options.final, options.sizes)
+    learned = "imitation" + (f", {options.augment}" if options.augment else "")
     rows = []
-    pool = Pool(options.env, _N_ENVS)
+    pool, visited = Pool(options.env, _N_ENVS), Pool(options.env, _N_ENVS, begin=make_starts(options.augment))
     for name, make in students(options.branches, options.seed).items():
         started = time.process_time()
-        act = learn(make, pool, options.env, options.n_timesteps, options.seed)
+        act = learn(make, visited, options.env, options.n_timesteps, options.seed, options.augment)
         seconds = round(time.process_time() - started, 1)
-        for kind, variations in sets:
-            for variation in variations:
-                played = play(pool, [variation], options.episodes, EVALUATION_SEED, act)
-                rows.append({"student": name, "set": kind, **_row(variation, played), "cpu_seconds": seconds})
-                print(rows[-1])
+        for kind, variation in wanted:
+            played = play(pool, [variation], options.episodes, EVALUATION_SEED, act)
+            about = {"student": name, "learned_by": learned, "set": kind, "cpu_seconds": seconds}
+            rows.append({**about, **_row(variation, played)})
+            print(rows[-1])
     pool.close()
+    visited.close()
     file = f"imitation_yardsticks_{options.env.rpartition('-')[0].lower()}"
-    write_results(file, COLUMNS, rows, {"n_timesteps": options.n_timesteps}, ["scikit-learn"])
+    file += f"_{options.augment}" if options.augment else ""
+    arguments = {"n_timesteps": options.n_timesteps, "augment": options.augment}
+    write_results(file, COLUMNS, rows, arguments, ["scikit-learn"])
 
 
 if __name__ == "__main__":

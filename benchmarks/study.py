@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,12 @@ def train(env_id: str, seed: int, folder: Path, overrides: dict[str, Any]) -> Pr
     return program
 
 
+@cache
+def commit() -> str:
+    """Return the commit that was checked out when this was first asked, before a long study."""
+    return subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
+
+
 def write_results(
     name: str,
     columns: Sequence[str],
@@ -75,10 +82,9 @@ def write_results(
     writer.writeheader()
     writer.writerows(rows)
     write_atomically(RESULTS / f"{name}.csv", table.getvalue())
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
     origin = {
         "command": " ".join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]]),
-        "commit": commit,
+        "commit": commit(),
         "overrides": overrides,
         "versions": {
             "python": platform.python_version(),

@@ -25,6 +25,7 @@ FIELDS = {
     "steps_std",
     "optimal_steps_mean",
     "semantics",
+    "learned_by",
 }
 
 
@@ -100,6 +101,7 @@ def test_stock_algorithms_are_trained_and_evaluated(algo, tmp_path, capsys):
     assert run([*evaluate, "--allow-pickle"]) == 0
     (row,) = json.loads(capsys.readouterr().out)
     assert row["semantics"] is None
+    assert row["learned_by"] is None
     assert run(["show", str(run_folder), "--allow-pickle"]) == 2
     start = ["train", "--algo", algo, "-i", str(run_folder), "-f", str(tmp_path / "b"), "-n", "64", *TINY]
     assert run(start) == 2
@@ -113,6 +115,7 @@ def test_evaluation_prints_only_json(program):
         (semantics, n_discs, 2**n_discs - 1) for semantics in ("soft", "crisp") for n_discs in (5, 6, 7, 8)
     ]
     assert all(set(row) == FIELDS for row in rows)
+    assert {row["learned_by"] for row in rows} == {"reinforcement"}
 
 
 def test_evaluation_table_shows_steps_optimum_and_ratio(program, capsys):

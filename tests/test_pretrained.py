@@ -62,6 +62,7 @@ def test_moves_of_the_shipped_program_obey_the_puzzles_rules_and_are_the_fewest(
         ("Hanoi-v0", {"n_discs": 7}, 1, 1.0),
         ("PandaReach-v0", {"n_targets": 8}, 3, None),
         ("PandaPush-v0", {"n_objects": 5}, 3, None),
+        ("PandaStack-v0", {"n_objects": 5}, 2, None),
         ("Stacking-v0", {"n_plates": 8}, 50, 1.35),
     ],
 )

@@ -145,6 +145,6 @@ def _programs(cells: Sequence[Row]) -> list[str]:
         if described is None:
             continue
         program = Program(**vars(parse_program(described.encode())))
-        title = html.escape(f"{cell['method']} on {cell['env']}, seed {cell['seed']}")
+        title = html.escape(f"{cell['method']} on {cell['env']}, seed {cell['seed']}, learned by {program.learned_by}")
         parts.append(f"<details><summary>{title}</summary><pre>{html.escape(str(program))}</pre></details>")
     return parts or ["<p>No method of this suite learns a program.</p>"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -50,10 +51,16 @@ def compare(
             raise ValueError(f"{sources[0].name} does not say which environment it is for")
         chosen = parse_variations(variations) if variations else default_variations(env_id)
         compared = compare_sources(sources, chosen, episodes, seed)
+        learned = [None if source.program is None else source.program.learned_by for source in sources]
     if as_json:
-        typer.echo(json.dumps([{"run": run.name, **row.to_json()} for run in compared for row in run.rows], indent=2))
+        described = [
+            {"run": run.name, **row.to_json(), "learned_by": how}
+            for run, how in zip(compared, learned, strict=True)
+            for row in run.rows
+        ]
+        typer.echo(json.dumps(described, indent=2))
     else:
-        _print_table(compared)
+        _print_table(compared, learned)
     if output is not None:
         buffer = io.BytesIO()
         draw_comparison(compared).savefig(buffer, format=output.suffix[1:].lower(), dpi=150)
@@ -61,7 +68,7 @@ def compare(
         typer.echo(f"Wrote {output}", err=True)
 
 
-def _print_table(compared: Any) -> None:
+def _print_table(compared: Any, learned: Sequence[str | None]) -> None:
     from rich.console import Console
     from rich.table import Table
 
@@ -70,8 +77,8 @@ def _print_table(compared: Any) -> None:
     names = list(first[0].variation)
     for name in names:
         table.add_column(name)
-    for run in compared:
-        table.add_column(run.name, justify="right", overflow="fold")
+    for run, how in zip(compared, learned, strict=True):
+        table.add_column(f"{run.name}\n{how}" if how else run.name, justify="right", overflow="fold")
     table.add_column("planner", justify="right")
     for number, row in enumerate(first):
         cells = []

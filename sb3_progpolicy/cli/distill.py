@@ -27,12 +27,16 @@ def distill(
     ] = None,
     n_timesteps: Annotated[int, typer.Option("--n-timesteps", "-n", min=1, help="states to label")] = 24_000,
     max_conditions: Annotated[int, typer.Option("--max-conditions", min=0, help="of the program at most")] = 11,
+    cell: Annotated[str, typer.Option("--cell", help="of the conditions: affine, or gru, which remembers")] = "affine",
     seed: Annotated[int, typer.Option("--seed", min=0, help="of all draws")] = 0,
     interaction: Annotated[
         bool, typer.Option("--interaction", help="let it read its previous action, reward and done flag, too")
     ] = False,
     augment: Annotated[
-        str | None, typer.Option("--augment", help="label states that were not visited, too: taller_towers")
+        str | None,
+        typer.Option(
+            "--augment", help="more than the training variations, for PandaStack: taller_towers or begun_towers"
+        ),
     ] = None,
     episodes: Annotated[int, typer.Option("--episodes", min=1, help="of the comparison with the teacher")] = 30,
     as_json: Annotated[bool, typer.Option("--json", help="a JSON object on stdout, nothing else")] = False,
@@ -40,7 +44,8 @@ def distill(
 ) -> None:
     """Learn a program from what a planner or a trained model does, and compare the two.
 
-    With -o, an interrupted run leaves its best program in the file, and goes on when it is started again.
+    With -o, an interrupted run leaves its best program in the file, and goes on when it is started again (with --cell
+    gru it begins anew).
     """
     if output is not None:
         check_folder(output)
@@ -55,6 +60,7 @@ def distill(
         arguments = {
             "n_timesteps": n_timesteps,
             "max_conditions": max_conditions,
+            "cell": cell,
             "seed": seed,
             "augment": augment,
             "interaction": interaction,
@@ -94,7 +100,8 @@ def _imitated(teacher: Any, env_id: str, output: Path | None, arguments: dict[st
 
     from sb3_progpolicy.imitation import imitate
 
-    state = None if output is None else output.with_suffix(".state.npz")
+    keeps_state = output is not None and arguments["cell"] == "affine"
+    state = output.with_suffix(".state.npz") if output is not None and keeps_state else None
     with Progress(console=Console(stderr=True)) as progress:
         bar = progress.add_task(f"Imitating on {env_id}", total=None)
 
@@ -107,8 +114,9 @@ def _imitated(teacher: Any, env_id: str, output: Path | None, arguments: dict[st
                 so_far.program.save(output)
 
         program = imitate(teacher, env_id, callback=show, checkpoint=state, **arguments)
-    if output is not None and state is not None:
+    if output is not None:
         program.save(output)
+    if state is not None:
         state.unlink(missing_ok=True)
     return program
 

@@ -43,10 +43,11 @@ def evaluate(
     with quiet_stdout():
         source = find_source(run_or_name, allow_pickle)
         rows = _evaluate(source, variations, episodes, semantics, seed, max_steps, env)
+    learned_by = None if source.program is None else source.program.learned_by
     if as_json:
-        typer.echo(json.dumps([row.to_json() for row in rows], indent=2))
+        typer.echo(json.dumps([{**row.to_json(), "learned_by": learned_by} for row in rows], indent=2))
     else:
-        _print_table(rows, None if source.program is None else f"learned by {source.program.learned_by}")
+        _print_table(rows, None if learned_by is None else f"learned by {learned_by}")
 
 
 def _evaluate(

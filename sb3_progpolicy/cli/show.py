@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 from gymnasium.envs.registration import load_env_creator
 
-from sb3_progpolicy.cli.parsing import ALLOW_PICKLE, check_folder
+from sb3_progpolicy.cli.parsing import ALLOW_PICKLE, check_folder, parse_variations
 from sb3_progpolicy.cli.streams import quiet_stdout
 from sb3_progpolicy.experiment.sources import find_source
 from sb3_progpolicy.nearest import unknown
@@ -19,8 +19,8 @@ from sb3_progpolicy.programs.files import write_atomically
 from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.programs.syntax import inputs_read
 
-FORMATS = ("text", "latex", "dot", "python", "c", "javascript", "png", "html", "onnx")
-FOR_READING = ("text", "latex", "dot", "png", "html")
+FORMATS = ("text", "latex", "dot", "python", "c", "javascript", "png", "activity", "html", "onnx")
+FOR_READING = ("text", "latex", "dot", "png", "activity", "html")
 _OF_SUFFIX = {
     ".txt": "text",
     ".tex": "latex",
@@ -43,9 +43,15 @@ def show(
         Path | None, typer.Option("-o", "--output", help="file to write; png, onnx: <environment>.png by default")
     ] = None,
     full: Annotated[bool, typer.Option("--full", help="as it was learnt, not simplified")] = False,
+    variation: Annotated[
+        list[str] | None, typer.Option("--set", help="activity: the variation of the episode, such as n_objects=3")
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="activity: of the episode")] = 0,
     allow_pickle: Annotated[bool, typer.Option("--allow-pickle", help=ALLOW_PICKLE)] = False,
 ) -> None:
     """Print a program as text, LaTeX, Graphviz, Python, C or JavaScript, draw it, or write a page or an ONNX model.
+
+    The format activity is a picture of one episode: which branch acts at which step.
 
     What is for reading (text, latex, dot, png, html) is simplified first where that is proven to change no decision
     from any start of training. What is for running has the numbers as they were learnt.
@@ -63,9 +69,17 @@ def show(
         program = source.program
         if format_ in FOR_READING and not full and not source.env_kwargs:
             program = _simplified(program, source.env_id)
-        content = _text(program, full) if format_ == "text" else _printed(program, format_, source.env_kwargs)
+        if format_ == "text":
+            content: str | bytes = _text(program, full)
+        elif format_ == "activity":
+            content = _activity(program, source.env_id, source.env_kwargs, variation, seed)
+        else:
+            content = _printed(program, format_, source.env_kwargs)
     if output is None and isinstance(content, bytes):
-        output = Path(_file_stem(source.program.metadata.get("env")) + f".{format_}")
+        output = Path(
+            _file_stem(source.program.metadata.get("env"))
+            + ("_activity.png" if format_ == "activity" else f".{format_}")
+        )
     if output is None:
         typer.echo(content, nl=False)
         if format_ == "text":
@@ -157,13 +171,33 @@ def _page(program: Program, env_kwargs: dict[str, Any]) -> str:
 def _drawn(program: Program) -> bytes:
     from sb3_progpolicy.programs import plot_program
 
+    _use_agg("png")
+    return _png(plot_program(program).figure, 150)
+
+
+def _activity(
+    program: Program, env_id: str | None, env_kwargs: dict[str, Any], variation: list[str] | None, seed: int
+) -> bytes:
+    from sb3_progpolicy.analysis.activity import plot_activity, record_activity
+
+    _use_agg("activity")
+    chosen, *others = parse_variations(variation or [])
+    if others:
+        raise ValueError(f"--set {' '.join(variation or [])} gives {1 + len(others)} variations; activity shows one")
+    return _png(plot_activity(record_activity(program, env_id, chosen, seed, env_kwargs)).figure, 100)
+
+
+def _use_agg(format_: str) -> None:
     try:
         import matplotlib
     except ImportError:
-        raise ValueError('png needs matplotlib: pip install "sb3-progpolicy[plot]"') from None
+        raise ValueError(f'{format_} needs matplotlib: pip install "sb3-progpolicy[plot]"') from None
     matplotlib.use("Agg")
+
+
+def _png(figure: Any, dpi: int) -> bytes:
     buffer = io.BytesIO()
-    plot_program(program).figure.savefig(buffer, format="png", dpi=150, bbox_inches="tight")
+    figure.savefig(buffer, format="png", dpi=dpi, bbox_inches="tight")
     return buffer.getvalue()
 
 

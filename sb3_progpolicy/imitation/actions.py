@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_progpolicy.imitation.decision_list import Floats
+from sb3_progpolicy.imitation.decision_list import DecisionList, Floats
 from sb3_progpolicy.imitation.losses import BoxLoss, DiscreteLoss, Loss
 from sb3_progpolicy.spaces import ActionSpec
 
@@ -54,6 +55,15 @@ class ActionCodec:
             return outputs.argmax(axis=1) + self.spec.start
         clipped = np.where(self.bounded, np.clip(outputs, -1, 1), outputs)
         return (clipped * self.half + self.middle).astype(np.float32)
+
+    def act_of(self, raw: DecisionList) -> Callable[[NDArray[np.floating]], NDArray[Any]]:
+        """Return a list on raw observations as a function from observations to actions."""
+
+        def act(inputs: NDArray[np.floating]) -> NDArray[Any]:
+            with_constant = np.column_stack([inputs.astype(np.float64), np.ones(len(inputs))])
+            return self.decode(raw.outputs(with_constant))
+
+        return act
 
     def to_action_units(self, controllers: Floats) -> Floats:
         """Return controllers whose outputs are actions, ``(n_branches, n_outputs, n_inputs + 1)``."""

@@ -9,31 +9,35 @@ from typing import Any
 
 import numpy as np
 
-from progpolicy_envs import find_domain
 from sb3_progpolicy.imitation.actions import ActionCodec
-from sb3_progpolicy.imitation.augmentation import Augment, make_augmentation
-from sb3_progpolicy.imitation.conversion import rounded, to_program
+from sb3_progpolicy.imitation.augmentation import Augment, make_augmentation, make_starts
+from sb3_progpolicy.imitation.conversion import make_program, rounded, to_program
 from sb3_progpolicy.imitation.decision_list import DecisionList
+from sb3_progpolicy.imitation.judge import Judge
 from sb3_progpolicy.imitation.learner import Learner, Settings
-from sb3_progpolicy.imitation.rollouts import Collector, Episodes, Pool, Variations, play, program_act
-from sb3_progpolicy.imitation.saving import load_state, save_state
+from sb3_progpolicy.imitation.memory import SHARES, MemoryRun, imitate_with_memory
+from sb3_progpolicy.imitation.recurrent import RECURRENT_CELLS
+from sb3_progpolicy.imitation.rollouts import Collector, Pool, Variations, program_act
+from sb3_progpolicy.imitation.saving import Scored, State, load_state, save_state
+from sb3_progpolicy.imitation.tasks import names_of, training_variations
 from sb3_progpolicy.imitation.teachers import Teacher, TeacherLike, make_teacher
 from sb3_progpolicy.programs.program import Program
+from sb3_progpolicy.programs.syntax import Expression
 from sb3_progpolicy.spaces import action_spec
 
 #: Share of the teacher in each round; 0 in all later ones.
 TEACHER_SHARES = (1.0, 0.6, 0.4, 0.3, 0.2, 0.1)
-N_ROUNDS, N_SPARSE_ROUNDS = 9, 2
+N_ROUNDS, N_SPARSE_ROUNDS = 9, 3
 # Of the mean loss, and whether few inputs matter more; the sparsest program first.
-_TOLERANCES = ((0.012, True), (0.006, True), (0.003, True), (0.003, False), (0.001, False))
+_TOLERANCES = ((0.012, True), (0.004, True), (0.003, False), (0.001, False))
 _FINALISTS = 3
 _CHANGED = 0.02  # share of the actions, or mean distance, that rounding may change
-_HOPELESS = 6.0  # times the tolerance below what is needed
-_SHORT = (1, 2, 4, 7)  # numbers of branches that are tried at the end
+_RARE, _DROPS = 0.03, 5  # share of the states in which a rare branch acts; how many are tried without
+_NEAR, _LOSS = 1.3, 0.01  # a list whose loss is so many times the best one's, and more, is not looked at
+_SHORT = (7, 4, 2, 1)  # numbers of branches that are tried at the end
 _DIGITS = (2, 3, 4, 6)
 #: Inputs that are not read by default: beyond the training sizes they take values that were never seen.
 IGNORED = ("left",)
-VALIDATION_SEED = 50_000_000  # no episode of the training has a seed near it
 
 
 @dataclass(frozen=True)
@@ -92,39 +96,47 @@ def imitate(
     :param tasks: variations to learn on, the easiest first; by default those that the domain is trained on
     :param n_timesteps: states to label
     :param max_conditions: of the program at most
-    :param cell: of the conditions; ``"affine"``
+    :param cell: of the conditions: ``"affine"``, or ``"gru"``, a memory of one unit each, where the teacher's action is
+        not a function of the present input
     :param seed: of all draws
     :param n_envs: environments that are stepped together
     :param interaction: whether the program reads its previous action, reward and done flag, too
     :param ignore: names of inputs that the program must not read
     :param score_tolerance: share of the score that fewer and rounder numbers may cost
-    :param n_episodes: of each validation, on training variations; the last ones have three times as many
+    :param n_episodes: of each validation, on training variations; the last ones have twice as many
     :param env_kwargs: constructor arguments of the environment
     :param augment: makes states that were not visited, which the teacher labels too: a function from observations and
-        a generator to observations, or ``"taller_towers"`` for PandaStack. What was learned so was shown more than the
-        training variations; the metadata say so
+        a generator to observations, or ``"taller_towers"`` for PandaStack; ``"begun_towers"`` begins its episodes with
+        a tower of up to four blocks instead. What was learned so was shown more than the training variations; the
+        metadata say so
     :param callback: is called after each round
     :param checkpoint: file in which the state is kept after each round; one that exists is gone on from
     :return: the program; its metadata say that it was learned by imitation, and of whom
     :raises ValueError: if an argument is not accepted
     """
-    if cell != "affine":
-        raise ValueError(f"cell={cell!r} is not accepted; conditions of imitated programs are 'affine'")
+    if cell not in ("affine", *RECURRENT_CELLS):
+        raise ValueError(f"cell={cell!r} is not accepted; conditions of imitated programs are 'affine' or 'gru'")
+    remembers = cell != "affine"
+    if remembers and (augment is not None or checkpoint is not None or max_conditions < 1):
+        raise ValueError(
+            f"cell={cell!r} is not accepted with augment={augment!r}, checkpoint={str(checkpoint)!r}, "
+            f"max_conditions={max_conditions}; only without augment and checkpoint, and with at least 1 condition: a "
+            "state that was not visited has no past, and the state of such an imitation is not kept"
+        )
     n_shares = N_ROUNDS + 1 + N_SPARSE_ROUNDS  # the first round has two
     if n_timesteps < n_shares * n_envs or max_conditions < 0 or n_episodes < 1:
         raise ValueError(
             f"n_timesteps={n_timesteps}, max_conditions={max_conditions}, n_episodes={n_episodes} are not accepted; "
             f"at least {n_shares * n_envs} (for n_envs={n_envs}), 0 and 1 are"
         )
-    pool = Pool(env_id, n_envs, env_kwargs, interaction)
-    try:
+    begin = make_starts(augment)
+    with Pool(env_id, n_envs, env_kwargs, interaction, begin) as pool:
         run = _Run(pool, teacher, env_id, tasks, seed, max_conditions + 1, ignore, n_episodes, score_tolerance, augment)
-        return run.run(n_timesteps // (n_shares * n_envs), callback, checkpoint)
-    finally:
-        pool.close()
-
-
-Scored = tuple[float, DecisionList]
+        n_states = n_timesteps // (len(SHARES) + 1 if remembers else n_shares)
+        with Pool(env_id, run.n_rows(n_states), env_kwargs, interaction, begin) as visited:
+            if remembers:
+                return run.run_with_memory(visited, n_states, callback)
+            return run.run(visited, n_states, callback, checkpoint)
 
 
 class _Run:
@@ -144,8 +156,7 @@ class _Run:
         augment: str | Augment | None,
     ) -> None:
         env: Any = pool.envs[0]
-        self.pool, self.seed, self.n_episodes = pool, seed, n_episodes
-        self.score_tolerance = score_tolerance
+        self.pool, self.seed = pool, seed
         self.spec = action_spec(env.action_space)
         self.inputs, self.outputs = names_of(env, self.spec.n_outputs, pool.interaction)
         self.codec = ActionCodec(self.spec, self.outputs)
@@ -154,9 +165,9 @@ class _Run:
         largest = max(ranks)
         # The smaller sizes are the ends of the larger ones, which therefore say more.
         ranked = list(zip(self.variations, ranks, strict=True))
-        self.validation = [one for least in (largest - 1, largest) for one, rank in ranked if rank >= least]
-        augmentation = make_augmentation(augment, self.inputs)
-        self.collector = Collector(pool, self.teacher, self.variations, ranks, seed, augmentation)
+        validation = [one for least in (largest - 1, largest) for one, rank in ranked if rank >= least]
+        self.judge = Judge(pool, validation, n_episodes, score_tolerance, self.teacher)
+        self.ranks, self.augmentation = ranks, make_augmentation(augment, self.inputs)
         self.origin: dict[str, Any] = {"env": env_id, "seed": seed, "teacher": self.teacher.name}
         if augment is not None:
             self.origin["augment"] = augment if isinstance(augment, str) else getattr(augment, "__name__", "function")
@@ -164,13 +175,33 @@ class _Run:
         self.learner = Learner(self.codec, readable, Settings(max_branches, seed))
         self.best: Scored | None = None
         self.runners_up: list[Scored] = []
-        self.final = False
+        #: Value of the best list of all, before it was made smaller: what smaller ones are held to.
+        self.reference = -np.inf
+        self.n_labelled = 0
         self.result: dict[str, float] = {}
-        self.last_result: dict[str, float] = {}
-        self.teacher_episodes: Episodes | None = None
 
-    def run(self, n_steps: int, callback: Callable[[Imitation], None] | None, checkpoint: Path | None) -> Program:
-        """Run all rounds, or those that a checkpoint leaves."""
+    def n_rows(self, n_states: int) -> int:
+        """Return in how many environments so many states are visited, so that each sees whole episodes."""
+        return min(len(self.pool), max(1, n_states // self.judge.limit))
+
+    def run(
+        self,
+        visited: Pool,
+        n_states: int,
+        callback: Callable[[Imitation], None] | None,
+        checkpoint: Path | None,
+    ) -> Program:
+        """Run all rounds, or those that a checkpoint leaves.
+
+        :param visited: environments in which states are visited
+        :param n_states: in each round; twice as many in the first
+        :param callback: see :func:`imitate`
+        :param checkpoint: see :func:`imitate`
+        """
+        self.collector = Collector(
+            visited, self.teacher, self.variations, self.ranks, self.seed, self.augmentation, self.judge.limit
+        )
+        n_steps = n_states // len(visited)
         origin = {
             **self.origin,
             "n_steps": n_steps,
@@ -180,26 +211,79 @@ class _Run:
         }
         first = 0
         if checkpoint is not None and checkpoint.exists():
-            first, self.best, self.collector.next_seed = load_state(checkpoint, origin, self.learner)
-            self.collector.rng = np.random.default_rng((self.seed, first))
-            self.runners_up = [self.best] if self.best is not None else []
-        self.final = first >= N_ROUNDS
-        self.teacher_episodes = play(self.pool, self.validation, self.n_episodes, VALIDATION_SEED, None, self.teacher)
-        self._limit_episodes()
-        self.collector.begin()
+            first = self._restore(load_state(checkpoint, origin))
+        self.judge.final = first >= N_ROUNDS
         total = N_ROUNDS + N_SPARSE_ROUNDS
         for number in range(first, total):
             self._round(number, n_steps)
             if checkpoint is not None:
-                save_state(checkpoint, origin, number + 1, self.learner, self.best, self.collector.next_seed)
+                save_state(checkpoint, origin, self._state(number + 1))
             if callback is not None:
                 callback(self._progress(number + 1, total))
         return self._program(self._rounded())
 
+    def run_with_memory(self, visited: Pool, n_states: int, callback: Callable[[Imitation], None] | None) -> Program:
+        """Run all rounds with conditions that remember. See :meth:`run`."""
+
+        def program_of(body: Expression) -> Program:
+            return make_program(body, self.spec, self.inputs, self.outputs, self.pool.interaction, **self._metadata)
+
+        def after_round(done: int, total: int, n_labelled: int, best: Program) -> None:
+            self.n_labelled = n_labelled
+            if callback is not None:
+                callback(Imitation(done, total, n_labelled, self.result, self.judge.teacher_episodes.summary(), best))
+
+        def score(program: Program) -> float:
+            reached = self.judge.score(program_act(program, len(self.pool)))
+            self.result = self.judge.last_result
+            return reached
+
+        run = MemoryRun(
+            collector=Collector(visited, self.teacher, self.variations, self.ranks, self.seed, None, self.judge.limit),
+            codec=self.codec,
+            readable=self.learner.readable,
+            seed=self.seed,
+            max_conditions=self.learner.settings.max_branches - 1,
+            horizon=int(self.judge.teacher_episodes.steps.mean()),
+            to_program=program_of,
+            score=score,
+            as_good=self.judge.as_good,
+            after_round=after_round,
+        )
+        return imitate_with_memory(run, n_states // len(visited))
+
+    def _state(self, number: int) -> State:
+        learner, collector = self.learner, self.collector
+        return State(
+            number=number,
+            next_seed=collector.next_seed,
+            generators={"learner": learner.rng.bit_generator.state, "collector": collector.rng.bit_generator.state},
+            observations=learner.observations,
+            targets=learner.targets,
+            weights=learner.weights,
+            present=learner.raw,
+            best=self.best,
+            runners_up=tuple(self.runners_up),
+            result=self.result,
+            reference=self.reference,
+        )
+
+    def _restore(self, state: State) -> int:
+        """Go back to a state; return the number of rounds that are done."""
+        learner, collector = self.learner, self.collector
+        learner.rng.bit_generator.state = state.generators["learner"]
+        collector.rng.bit_generator.state = state.generators["collector"]
+        collector.next_seed = state.next_seed
+        learner.observations, learner.targets, learner.weights = state.observations, state.targets, state.weights
+        learner.raw, self.best, self.runners_up = state.present, state.best, list(state.runners_up)
+        self.result, self.reference = dict(state.result), state.reference
+        return state.number
+
     def _round(self, number: int, n_steps: int) -> None:
         learner = self.learner
+        self.collector.begin()
         share = TEACHER_SHARES[number] if number < len(TEACHER_SHARES) else 0.0
-        student = None if learner.raw is None else self._act(learner.raw)
+        student = None if learner.raw is None else self.codec.act_of(learner.raw)
         visits = self.collector.collect(n_steps * (1 if number else 2), student, share)
         targets = self.codec.encode(visits.actions) if visits.good is None else visits.good.astype(np.float64)
         learner.add(visits.inputs, targets, visits.weights)
@@ -216,45 +300,84 @@ class _Run:
             self._make_sparse()
             return
         self._offer(learner.refit_sparse(), sparse=True)
+        if number == N_ROUNDS + N_SPARSE_ROUNDS - 1:
+            self._drop_rare_branches()
 
     def _choose_finally(self) -> None:
         """Let the best few play more episodes, which none of them was chosen by."""
-        self.final = True
+        self.judge.final = True
         self.best = None
         for _, candidate in list(self.runners_up):
             self._offer(candidate)
+        assert self.best is not None
+        self.learner.raw, self.reference = self.best[1], self._value(self.best)
 
     def _make_short(self) -> None:
-        """Go on with a list of fewer branches if its episodes are as good as the best ones."""
+        """Go on with lists of fewer and fewer branches as long as their episodes are as good as the best ones."""
         assert self.best is not None
-        score, best = self.best
-        for n_branches in (number for number in _SHORT if number < best.n_branches):
-            short = self.learner.short(n_branches)
-            if not self.learner.is_near(short, best):
-                continue
-            reached = self._score(short, score)
-            if self._as_good(reached, score):
-                self.best, self.result = (reached, short), self.last_result
+        most = self.best[1].n_branches
+        for n_branches in (number for number in _SHORT if number < most):
+            if self._take_over(self.learner.short(n_branches)) is not None:
                 return
 
     def _make_sparse(self) -> None:
-        """Go on with the program of fewest inputs whose episodes are as good as the best ones."""
+        """Go on with the program of fewest inputs whose episodes are as good as the best ones.
+
+        If there is none, the rounds that follow are those of the best one of few inputs, whose mistakes they visit.
+        """
         assert self.best is not None
-        score, dense = self.best
+        dense, few = self.best[1], []
         for tolerance, always_few in _TOLERANCES:
             sparse = self.learner.sparse(dense, tolerance, always_few)
-            reached = self._score(sparse, score)
-            if self._as_good(reached, score):
-                self.best, self.learner.raw, self.result = (reached, sparse), sparse, self.last_result
+            reached = self._take_over(sparse)
+            if reached is None:
                 return
-        self.learner.raw = dense
+            if always_few:
+                few.append((reached, sparse))
+        self.learner.raw = max(few, key=lambda scored: scored[0])[1]
+
+    def _drop_rare_branches(self) -> None:
+        """Leave out branches that hardly ever act, one after another, as long as the episodes stay as good."""
+        assert self.best is not None
+        tries = 0
+        while self.best[1].n_branches > 1:
+            for index in self.learner.rare_branches(self.best[1], _RARE):
+                if tries == _DROPS:
+                    return
+                tries += 1
+                if self._take_over(self.learner.without(self.best[1], index)) is None:
+                    break
+            else:
+                return
+
+    def _take_over(self, candidate: DecisionList) -> float | None:
+        """Go on with a smaller list if its loss is not far from the best one's and its episodes are as good.
+
+        :return: ``None``, or, if it is not so, its value
+        """
+        assert self.best is not None
+        if self.learner.loss_of(candidate) > _NEAR * self.learner.loss_of(self.best[1]) + _LOSS:
+            return -np.inf
+        reached = self._score(candidate, self.best[0])
+        value = self._value((reached, candidate))
+        if not self.judge.as_good(value, self.reference):
+            return value
+        self.best, self.learner.raw, self.result = (reached, candidate), candidate, self.judge.last_result
+        return None
+
+    def _value(self, scored: Scored) -> float:
+        """Return the score less the loss where states were labelled that no episode comes to, else the score."""
+        score, candidate = scored
+        return score if self.augmentation is None else score - self.learner.loss_of(candidate)
 
     def _offer(self, candidate: DecisionList, sparse: bool = False) -> None:
         """Keep a candidate if its episodes are better than the best so far."""
-        reached = self._score(candidate)
-        self.runners_up = sorted([*self.runners_up, (reached, candidate)], key=lambda scored: -scored[0])[:_FINALISTS]
-        if self.best is None or reached >= self.best[0] or (sparse and self._as_good(reached, self.best[0])):
-            self.best, self.result = (reached, candidate), self.last_result
+        offered = self._score(candidate), candidate
+        ranked = sorted([*self.runners_up, offered], key=self._value, reverse=True)
+        self.runners_up = ranked[:_FINALISTS]
+        value, least = self._value(offered), -np.inf if self.best is None else self._value(self.best)
+        if value >= least or (sparse and self.judge.as_good(value, self.reference)):
+            self.best, self.result = offered, self.judge.last_result
 
     def _rounded(self) -> DecisionList:
         """Return the best list with as few digits as its episodes allow, its outputs in the unit of actions."""
@@ -262,58 +385,21 @@ class _Run:
         score, best = self.best
         raw = DecisionList(best.conditions, self.codec.to_action_units(best.controllers))
         states = self.learner.observations[:: max(1, self.learner.n_states // 2000)]
-        exact = self._act(best)(states)
+        exact = self.codec.act_of(best)(states)
         for digits in _DIGITS:
             candidate = rounded(raw, digits, self.codec.unit)
             program = self._program(candidate)
             changed = self.codec.distance(program_act(program, len(states))(states), exact).mean()
-            if changed <= _CHANGED and self._as_good(self._program_score(program, score), score, share=0.5):
+            if changed > _CHANGED:
+                continue
+            if self.judge.as_good(self.judge.score(program_act(program, len(self.pool)), score), score, share=0.5):
                 return candidate
         return raw
 
-    def _as_good(self, reached: float, score: float, share: float = 1.0) -> bool:
-        return reached >= score - share * self.score_tolerance * max(1.0, abs(score))
-
     def _score(self, raw: DecisionList, needed: float | None = None) -> float:
-        return self._play(self._act(raw), needed)
-
-    def _program_score(self, program: Program, needed: float) -> float:
-        return self._play(program_act(program, len(self.pool)), needed)
-
-    @property
-    def _teacher_steps(self) -> float:
-        assert self.teacher_episodes is not None
-        return float(self.teacher_episodes.steps.mean())
-
-    def _play(self, act: Any, needed: float | None = None) -> float:
-        """Return the score in validation episodes; if the first third is far from what is needed, that of these."""
-        seed, n_episodes = VALIDATION_SEED, self.n_episodes
-        if self.final:
-            seed += n_episodes
-        episodes = play(self.pool, self.validation, n_episodes, seed, act)
-        score = episodes.score(self._teacher_steps)
-        if self.final and (needed is None or self._as_good(score, needed, share=_HOPELESS)):
-            episodes = play(self.pool, self.validation, 3 * n_episodes, seed, act)
-            score = episodes.score(self._teacher_steps)
-        self.collector.begin()
-        self.last_result = episodes.summary()
-        return score
-
-    def _act(self, raw: DecisionList) -> Any:
-        def act(inputs: np.ndarray) -> np.ndarray:
-            with_constant = np.column_stack([inputs.astype(np.float64), np.ones(len(inputs))])
-            return self.codec.decode(raw.outputs(with_constant))
-
-        return act
-
-    def _limit_episodes(self) -> None:
-        """End episodes of the mixture that take far longer than the teacher's."""
-        assert self.teacher_episodes is not None
-        if len(self.teacher_episodes.successes):
-            self.collector.limit = min(self.pool.cap, int(2 * self.teacher_episodes.steps.max() + 50))
+        return self.judge.score(self.codec.act_of(raw), needed)
 
     def _progress(self, number: int, total: int) -> Imitation:
-        assert self.teacher_episodes is not None
         assert self.learner.raw is not None
         raw = self.learner.raw if self.best is None else self.best[1]
         in_units = DecisionList(raw.conditions, self.codec.to_action_units(raw.controllers))
@@ -322,54 +408,13 @@ class _Run:
             total,
             self.learner.n_states,
             self.result,
-            self.teacher_episodes.summary(),
+            self.judge.teacher_episodes.summary(),
             self._program(in_units),
         )
 
     def _program(self, raw: DecisionList) -> Program:
-        return to_program(
-            raw,
-            self.spec,
-            self.inputs,
-            self.outputs,
-            self.pool.interaction,
-            **self.origin,
-            learned_by="imitation",
-            labelled_states=self.learner.n_states,
-        )
+        return to_program(raw, self.spec, self.inputs, self.outputs, self.pool.interaction, **self._metadata)
 
-
-def training_variations(env_id: str, tasks: Variations | None) -> tuple[Variations, list[int]]:
-    """Return the variations to learn on and the rank of each one's size.
-
-    :param env_id: environment id
-    :param tasks: variations, the easiest first; by default those that the domain is trained on
-    :raises ValueError: if there are none
-    """
-    domain = find_domain(env_id)
-    if tasks is not None and not len(tasks):
-        raise ValueError("tasks=[] is not accepted; at least one variation, such as {}, is needed")
-    variations: Variations = list(tasks) if tasks is not None else list(domain.train) if domain is not None else [{}]
-    if domain is None or not all(domain.size in variation for variation in variations):
-        return variations, [0] * len(variations)
-    sizes = sorted({variation[domain.size] for variation in variations})
-    return variations, [sizes.index(variation[domain.size]) for variation in variations]
-
-
-def names_of(env: Any, n_outputs: int, interaction: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return readable names of a program's inputs and outputs, the environment's own where it has them.
-
-    :param env: an environment
-    :param n_outputs: of a controller
-    :param interaction: whether the previous action, reward and done flag are inputs, too
-    """
-    n_observations = env.observation_space.shape[0]
-    inputs = tuple(map(str, getattr(env.unwrapped, "observation_names", ())))
-    outputs = tuple(map(str, getattr(env.unwrapped, "action_names", ())))
-    if len(inputs) != n_observations:
-        inputs = tuple(f"observation[{index}]" for index in range(n_observations))
-    if len(outputs) != n_outputs:
-        outputs = tuple(f"action[{index}]" for index in range(n_outputs))
-    if interaction:
-        inputs = (*inputs, *(f"previous {name}" for name in outputs), "previous reward", "previous done")
-    return inputs, outputs
+    @property
+    def _metadata(self) -> dict[str, Any]:
+        return {**self.origin, "learned_by": "imitation", "labelled_states": self.n_labelled or self.learner.n_states}

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from sb3_progpolicy.imitation.actions import ActionCodec
-from sb3_progpolicy.imitation.algorithm import training_variations
 from sb3_progpolicy.imitation.rollouts import Pool, Variations, play, program_act
+from sb3_progpolicy.imitation.tasks import training_variations
 from sb3_progpolicy.imitation.teachers import TeacherLike, make_teacher
 from sb3_progpolicy.programs.program import Program
 

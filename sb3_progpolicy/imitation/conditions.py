@@ -11,6 +11,7 @@ from sb3_progpolicy.imitation.losses import eliminate
 
 _SHARPNESS = 4.0  # of a condition whose values have a deviation of 1, taken for a logistic regression
 _SUPPORTS = (1, 2, 3, 4, 5, 6, 8, 10)
+_SAMPLE = 4_000  # states for a regression
 
 
 def fit_condition(
@@ -37,16 +38,18 @@ def fit_condition(
         return None, 0.0
     best: Floats | None = None
     value = -np.inf
+    rows, sizes = _sample(gains)
+    some, better = inputs[rows], wanted[rows]
     if start is not None:
         best, value = start, float(gains[inputs @ start >= 0].sum())
         shifted, shifted_value = _best_constant(inputs, start, gains)
         if shifted_value > value + 1e-9:
             best, value = shifted, shifted_value
     for caution in cautions:
-        costs = np.abs(gains) * np.where(wanted, 1.0, caution)
+        costs = sizes * np.where(better, 1.0, caution)
         direction = start if caution == 1.0 else None
         for ridge in ridges:
-            direction = logistic(inputs, wanted, costs, direction, ridge)
+            direction = logistic(some, better, costs, direction, ridge)
             shifted, shifted_value = _best_constant(inputs, direction, gains)
             if shifted_value > value:
                 best, value = shifted, shifted_value
@@ -68,26 +71,43 @@ def fit_sparse_condition(
     full, value = fit_condition(inputs, gains, start, ridges=(1e-3,))
     if full is None:
         return start
-    costs = np.abs(gains) / np.abs(gains).mean()
+    rows, costs = _sample(gains)
+    some, costs = inputs[rows], costs / costs.mean()
     paths = [
-        _elimination(inputs, costs, direction)
-        for direction in (logistic(inputs, gains > 0, costs, None, 1e-4), _SHARPNESS * full)
+        _elimination(some, costs, direction)
+        for direction in (logistic(some, gains[rows] > 0, costs, None, 1e-4), _SHARPNESS * full)
     ]
     best, most = full, -np.inf
     for size in _SUPPORTS:
+        found = []
         for path in paths:
             kept, adjusted = next(step for step in path if step[0].sum() <= size + 1)
-            part = inputs[:, kept]
-            fewer, _ = fit_condition(part, gains, adjusted[kept], ridges=(1e-3, 1e-5), cautions=(1.0, 2.0))
-            if fewer is None:
-                continue
-            fewer, reached = improve(part, gains, fewer)
-            if reached > most:
-                best, most = np.zeros(len(kept)), reached
-                best[kept] = fewer
-            if reached >= value - tolerance:
-                return best
+            fewer, gained = fit_condition(inputs[:, kept], gains, adjusted[kept], ridges=(1e-4,), cautions=(1.0, 2.0))
+            if fewer is not None:
+                found.append((gained, kept, fewer))
+        if not found:
+            continue
+        _, kept, fewer = max(found, key=lambda one: one[0])
+        fewer, reached = improve(inputs[:, kept], gains, fewer)
+        if reached > most:
+            best, most = np.zeros(len(kept)), reached
+            best[kept] = fewer
+        if reached >= value - tolerance:
+            return best
     return best if always_few else full
+
+
+def _sample(gains: Floats) -> tuple[np.ndarray, Floats]:
+    """Return which states a regression looks at, and what each of them counts.
+
+    Of many states some are drawn at equal distances of the summed size of gains, so that all of them count the same.
+    """
+    sizes = np.abs(gains)
+    if len(gains) <= _SAMPLE:
+        return np.arange(len(gains)), sizes
+    sums = np.cumsum(sizes)
+    rows = np.searchsorted(sums, (np.arange(_SAMPLE) + 0.5) / _SAMPLE * sums[-1])
+    return np.minimum(rows, len(gains) - 1), np.ones(_SAMPLE)
 
 
 def _elimination(inputs: Floats, costs: Floats, direction: Floats) -> list[tuple[np.ndarray, Floats]]:

@@ -37,6 +37,21 @@ def to_program(
     for weights, controller in reversed(list(zip(raw.conditions.tolist(), controllers[:-1], strict=True))):
         condition = Condition("affine", (), (), (), (), tuple(weights[:-1]), weights[-1])
         body = IfThenElse(condition, controller, body)
+    return make_program(body, spec, input_names, output_names, interaction, **metadata)
+
+
+def make_program(
+    body: Expression,
+    spec: ActionSpec,
+    input_names: tuple[str, ...],
+    output_names: tuple[str, ...],
+    interaction: bool,
+    **metadata: Any,
+) -> Program:
+    """Return a program. See :func:`to_program`.
+
+    :param body: on raw observations, with outputs in the unit of the actions
+    """
     return Program(
         body=body,
         n_observations=len(input_names) - (spec.interaction_size if interaction else 0),

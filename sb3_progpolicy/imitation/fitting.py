@@ -11,6 +11,7 @@ from sb3_progpolicy.imitation.losses import Loss, mean_loss
 
 _NEIGHBOURS = 120
 _FAILURES = 2  # draws of controllers in a row of which none helps
+_COMMON = 0.05  # share of the states from which on a branch has to be exact
 _LEAST = 1e-3  # gains below it do not matter
 
 
@@ -246,7 +247,7 @@ def sparsify(
             here = branches == index
             if here.sum() > 40:
                 # A branch of few states may be less exact.
-                allowed = tolerance * max(1.0, 0.02 * n / here.sum())
+                allowed = tolerance * max(1.0, _COMMON * n / here.sum())
                 controllers[index] = loss.fit_sparse(data.take(here), controllers[index], allowed, always_few)
         losses = loss.matrix(data, controllers)
         holds = data.inputs @ conditions.T >= 0

@@ -16,7 +16,6 @@ from sb3_progpolicy.imitation.tuning import fine_tune
 _FEW, _MANY = 6_000, 15_000  # states for a fit from nothing, and for one that only improves
 _REFIT_EVERY = 3  # rounds
 _COMPETES = 1.3  # a list whose loss is so many times the least has its episodes looked at, too
-_NEAR = 2.0  # times the loss of a list: a shorter one beyond it is not looked at
 _RESTARTS = 3  # of the fit by planes
 
 
@@ -33,7 +32,7 @@ class Settings:
     max_branches: int
     seed: int
     round_steps: int = 400
-    final_steps: int = 2000
+    final_steps: int = 1200
 
 
 class Learner:
@@ -96,11 +95,13 @@ class Learner:
         polished = [self._polished(program, data, 0.3) for program in fresh]
         return _raw(min(polished, key=lambda program: mean_loss(self.loss, program, data)), scaler)
 
-    def is_near(self, raw: DecisionList, other: DecisionList) -> bool:
-        """Return whether the loss of a list is so near another's that its episodes are worth a look."""
+    def loss_of(self, raw: DecisionList) -> float:
+        """Return the mean loss of a list in all labelled states.
+
+        :param raw: on raw observations
+        """
         scaler, data = self._prepared()
-        one, two = (mean_loss(self.loss, self._scaled(program, scaler), data) for program in (raw, other))
-        return one <= _NEAR * two + 0.01
+        return mean_loss(self.loss, self._scaled(raw, scaler), data)
 
     def sparse(self, raw: DecisionList, tolerance: float, always_few: bool) -> DecisionList:
         """Return a list with few inputs, fitted again with these alone.
@@ -112,6 +113,26 @@ class Learner:
         scaler, data = self._prepared()
         sparse = sparsify(self.loss, self._scaled(raw, scaler), self._some(data, _MANY), tolerance, always_few)
         return self._refitted(sparse, data, scaler, self.settings.final_steps)
+
+    def rare_branches(self, raw: DecisionList, share: float) -> list[int]:
+        """Return the branches that act in fewer states than a share, the rarest first.
+
+        :param raw: on raw observations
+        :param share: of all labelled states
+        """
+        scaler, data = self._prepared()
+        acting = self._scaled(raw, scaler).branches(data.inputs)
+        shares = np.bincount(acting, minlength=raw.n_branches) / len(data)
+        return [int(index) for index in np.argsort(shares, kind="stable") if shares[index] < share]
+
+    def without(self, raw: DecisionList, index: int) -> DecisionList:
+        """Return a list without a branch, its numbers that are not 0 fitted again.
+
+        :param raw: on raw observations
+        :param index: of the branch
+        """
+        scaler, data = self._prepared()
+        return self._refitted(self._scaled(raw.without(index), scaler), data, scaler, self.settings.round_steps)
 
     def refit_sparse(self) -> DecisionList:
         """Fit the numbers of the present list that are not 0 to all states, and return it."""

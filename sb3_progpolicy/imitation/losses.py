@@ -15,8 +15,10 @@ if TYPE_CHECKING:
 _DELTA = 0.1  # Huber's: errors beyond it count by their size, not its square
 _SATURATED = 0.999
 _OVERSHOOT = 0.15  # weight of too much along a direction that the teacher has shortened to fit into the bounds
+_SMALL = 0.1  # labels up to it count as meant, not as shortened
 _MAX_NATS = 3.0  # a wrong decision costs no more than this, however sure it is
 _SUPPORTS = (0, 1, 2, 3, 4, 6, 8, 12)
+_FEW = 6  # inputs
 
 
 class Loss(Protocol):
@@ -31,7 +33,7 @@ class Loss(Protocol):
     def fit_sparse(self, data: Data, start: Floats, tolerance: float, always_few: bool = False) -> Floats:
         """Return the controller of fewest inputs whose mean loss is at most ``tolerance`` above the least.
 
-        With ``always_few`` it is one of few inputs even if none is within the tolerance.
+        With ``always_few`` it is one of at most six inputs for each output even if none is within the tolerance.
         """
 
     def expected(self, outputs: th.Tensor, targets: th.Tensor) -> th.Tensor:
@@ -110,7 +112,7 @@ class BoxLoss:
             supports = eliminate(hessian, full[output])
             limit = self._one(data, full[output], output, slack) + tolerance
             least = np.inf
-            for size in _SUPPORTS:
+            for size in _SUPPORTS[: _SUPPORTS.index(_FEW) + 1] if always_few else _SUPPORTS:
                 support = next(kept for kept, _ in supports if kept.sum() <= size + 1)
                 row = self._fit_support(data, output, support, slack)
                 reached = self._one(data, row, output, slack)
@@ -142,7 +144,8 @@ class BoxLoss:
         if self.direction:
             columns = list(self.direction)
             saturated = np.abs(targets[:, columns]) >= _SATURATED
-            slack[:, columns] = np.where(saturated.any(axis=1, keepdims=True) & ~saturated, _OVERSHOOT, 1.0)
+            shortened = saturated.any(axis=1, keepdims=True) & ~saturated & (np.abs(targets[:, columns]) > _SMALL)
+            slack[:, columns] = np.where(shortened, _OVERSHOOT, 1.0)
         return slack
 
     def _reweighted(self, data: Data, row: Floats, output: int, slack: Floats) -> Floats:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_progpolicy.evaluation import spec_of
-from sb3_progpolicy.imitation.augmentation import Augment
+from sb3_progpolicy.imitation.augmentation import Augment, Begin
 from sb3_progpolicy.imitation.teachers import Observations, PlannerTeacher, Situation, Teacher, join_history
 from sb3_progpolicy.programs.interpreter import ProgramRunner
 from sb3_progpolicy.programs.syntax import ProgramData
@@ -34,13 +34,19 @@ class Pool:
     :param n_envs: how many
     :param env_kwargs: constructor arguments
     :param interaction: whether a student reads the previous action, reward and done flag too
+    :param begin: begins an episode in another way than ``reset``
     :raises ValueError: if the id is not known or the observations are not accepted
     """
 
     def __init__(
-        self, env_id: str, n_envs: int, env_kwargs: Mapping[str, Any] | None = None, interaction: bool = False
+        self,
+        env_id: str,
+        n_envs: int,
+        env_kwargs: Mapping[str, Any] | None = None,
+        interaction: bool = False,
+        begin: Begin | None = None,
     ) -> None:
-        self.interaction = interaction
+        self.interaction, self._begin = interaction, begin
         spec = spec_of(env_id)
         self.envs: list[Any] = [gym.make(spec.id, **(env_kwargs or {})) for _ in range(n_envs)]
         space = check_observation_space(self.envs[0].observation_space)
@@ -66,7 +72,10 @@ class Pool:
 
     def reset(self, row: int, seed: int, variation: Mapping[str, Any]) -> None:
         """Begin an episode."""
-        self.observations[row] = self.envs[row].reset(seed=seed, options=dict(variation) or None)[0]
+        if self._begin is not None:
+            self.observations[row] = self._begin(self.envs[row], seed, variation)
+        else:
+            self.observations[row] = self.envs[row].reset(seed=seed, options=dict(variation) or None)[0]
 
     def situation(self, rows: Sequence[int] | None = None) -> Situation:
         """Return what a teacher may look at."""
@@ -84,6 +93,12 @@ class Pool:
         """Close the environments."""
         for env in self.envs:
             env.close()
+
+    def __enter__(self) -> Pool:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
 
 
 @dataclass(frozen=True)
@@ -143,6 +158,8 @@ def play(
         if teacher is not None:
             teacher.begin()
         pool.begin()
+        if isinstance(act, ProgramAct):
+            act.begin()
         for row in rows:
             pool.reset(row, seed + first + row, variations[(first + row) % len(variations)])
         live = list(rows)
@@ -178,10 +195,28 @@ def _labels(pool: Pool, teacher: Teacher | None, live: Sequence[int]) -> NDArray
     return labels
 
 
-def program_act(program: ProgramData, n_envs: int) -> Act:
+class ProgramAct:
+    """The crisp program as a function from observations to actions, which remembers.
+
+    :param program: the program
+    :param n_envs: number of rows of observations
+    """
+
+    def __init__(self, program: ProgramData, n_envs: int) -> None:
+        self._runner = ProgramRunner(program, n_envs)
+
+    def begin(self) -> None:
+        """Forget everything: other episodes are played from now on."""
+        self._runner.reset()
+
+    def __call__(self, observations: Observations) -> NDArray[Any]:
+        """Return actions ``(n_envs, *action_shape)``."""
+        return self._runner.act(observations)
+
+
+def program_act(program: ProgramData, n_envs: int) -> ProgramAct:
     """Return the crisp program as a function from observations to actions."""
-    runner = ProgramRunner(program, n_envs)
-    return lambda observations: runner.act(observations)
+    return ProgramAct(program, n_envs)
 
 
 @dataclass
@@ -205,7 +240,7 @@ class Visits:
 
 
 class Collector:
-    """Environments that go on between calls, in which teacher and student take turns (Ross et al. 2011).
+    """Environments in which teacher and student take turns (Ross et al. 2011).
 
     Larger variations are drawn more often, since their ends are states of the smaller ones: each size twice as often as
     the one before. In an environment with a goal, a student that comes to the same state for the third time in an
@@ -217,6 +252,7 @@ class Collector:
     :param ranks: size of each variation as a number from 0 on
     :param seed: of the draws and of the episodes
     :param augment: makes changed copies of half of the states, which are labelled too
+    :param limit: steps after which an episode is ended; by default the environment's own
     """
 
     def __init__(
@@ -227,6 +263,7 @@ class Collector:
         ranks: Sequence[int],
         seed: int,
         augment: Augment | None = None,
+        limit: int | None = None,
     ) -> None:
         self.augment = augment
         self.pool, self.teacher, self.variations = pool, teacher, variations
@@ -234,7 +271,7 @@ class Collector:
         self.chances = chances / chances.sum()
         self.rng = np.random.default_rng(seed)
         self.next_seed = 100_000 * (seed + 1)
-        self.limit = pool.cap
+        self.limit = pool.cap if limit is None else limit
         self._guided, self._left = np.zeros(len(pool), dtype=bool), np.zeros(len(pool), dtype=np.int64)
         self._elapsed = np.zeros(len(pool), dtype=np.int64)
         self._seen: list[dict[str | bytes, int]] = [{} for _ in range(len(pool))]

@@ -1,64 +1,95 @@
-"""The state of an imitation in a file, so that an interrupted one goes on."""
+"""The state of an imitation in a file, so that an interrupted one goes on as if nothing had happened."""
 
 from __future__ import annotations
 
 import io
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from sb3_progpolicy.imitation.decision_list import DecisionList
+from sb3_progpolicy.imitation.decision_list import DecisionList, Floats
 from sb3_progpolicy.programs.files import write_atomically
 
-if TYPE_CHECKING:
-    from sb3_progpolicy.imitation.learner import Learner
-
-Best = tuple[float, DecisionList] | None
+Scored = tuple[float, DecisionList]
 
 
-def save_state(
-    path: Path, origin: Mapping[str, Any], number: int, learner: Learner, best: Best, next_seed: int
-) -> None:
-    """Write labelled states, the present list and the best one.
+@dataclass(frozen=True)
+class State:
+    """All that an imitation knows between two rounds.
+
+    :param number: rounds that are done
+    :param next_seed: of the next episode
+    :param generators: states of NumPy's generators, by name
+    :param observations: labelled states, ``(n, n_inputs)``
+    :param targets: their labels, ``(n, n_outputs)``
+    :param weights: ``(n,)``
+    :param present: the present list
+    :param best: score and list; ``None`` before the first validation
+    :param runners_up: the best few with their scores
+    :param result: of the best list in its validation
+    :param reference: value of the best list before it was made smaller
+    """
+
+    number: int
+    next_seed: int
+    generators: Mapping[str, Any]
+    observations: np.ndarray
+    targets: Floats
+    weights: Floats
+    present: DecisionList | None
+    best: Scored | None
+    runners_up: tuple[Scored, ...]
+    result: Mapping[str, float]
+    reference: float
+
+
+def save_state(path: Path, origin: Mapping[str, Any], state: State) -> None:
+    """Write a state.
 
     :param path: of the file
     :param origin: what the imitation is of
-    :param number: rounds that are done
-    :param learner: the student
-    :param best: score and list
-    :param next_seed: of the next episode
+    :param state: to write
     """
-    lists: dict[str, DecisionList | None] = {"present": learner.raw, "best": None if best is None else best[1]}
+    scored = [*([state.best] if state.best is not None else []), *state.runners_up]
+    lists = {f"scored{index}": program for index, (_, program) in enumerate(scored)}
+    if state.present is not None:
+        lists["present"] = state.present
     arrays: dict[str, Any] = {
         f"{name}_{part}": getattr(program, part)
         for name, program in lists.items()
-        if program is not None
         for part in ("conditions", "controllers")
     }
-    score = None if best is None else best[0]
-    about = {"origin": _as_json(origin), "number": number, "score": score, "next_seed": next_seed}
+    about = {
+        "origin": _as_json(origin),
+        "number": state.number,
+        "next_seed": state.next_seed,
+        "generators": state.generators,
+        "has_best": state.best is not None,
+        "scores": [score for score, _ in scored],
+        "result": dict(state.result),
+        "reference": state.reference,
+    }
     content = io.BytesIO()
     np.savez_compressed(
         content,
         about=np.array(json.dumps(about)),
-        observations=learner.observations,
-        targets=learner.targets.astype(np.float32),
-        weights=learner.weights.astype(np.float32),
+        observations=state.observations,
+        targets=state.targets,
+        weights=state.weights,
         **arrays,
     )
     write_atomically(path, content.getvalue())
 
 
-def load_state(path: Path, origin: Mapping[str, Any], learner: Learner) -> tuple[int, Best, int]:
-    """Put a saved state into a student.
+def load_state(path: Path, origin: Mapping[str, Any]) -> State:
+    """Read a state.
 
     :param path: of the file
     :param origin: what the imitation is of
-    :param learner: the student
-    :return: rounds that are done, the best score and list, the seed of the next episode
     :raises ValueError: if the file is of another imitation or is damaged
     """
     try:
@@ -66,7 +97,21 @@ def load_state(path: Path, origin: Mapping[str, Any], learner: Learner) -> tuple
             parts = {name: arrays[name] for name in arrays.files}
         about = json.loads(str(parts["about"]))
         known = about["origin"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        scored = [(score, _list(parts, f"scored{index}")) for index, score in enumerate(about["scores"])]
+        state = State(
+            number=about["number"],
+            next_seed=about["next_seed"],
+            generators=about["generators"],
+            observations=parts["observations"],
+            targets=parts["targets"],
+            weights=parts["weights"],
+            present=_list(parts, "present") if "present_controllers" in parts else None,
+            best=scored[0] if about["has_best"] else None,
+            runners_up=tuple(scored[int(about["has_best"]) :]),
+            result=about["result"],
+            reference=about["reference"],
+        )
+    except (OSError, EOFError, ValueError, KeyError, TypeError, IndexError) as error:
         raise ValueError(f"{path} is not the state of an imitation: {error}; remove it to begin anew") from None
     given = _as_json(origin)
     different = [name for name in {**known, **given} if known.get(name) != given.get(name)]
@@ -75,12 +120,7 @@ def load_state(path: Path, origin: Mapping[str, Any], learner: Learner) -> tuple
             f"{path} is of an imitation with another {', '.join(different)}; give the same arguments, or remove it to "
             "begin anew"
         )
-    learner.observations = parts["observations"]
-    learner.targets, learner.weights = parts["targets"].astype(np.float64), parts["weights"].astype(np.float64)
-    learner.rng = np.random.default_rng((learner.settings.seed, about["number"]))
-    learner.raw = _list(parts, "present")
-    best = _list(parts, "best")
-    return about["number"], None if best is None else (about["score"], best), about["next_seed"]
+    return state
 
 
 def _as_json(origin: Mapping[str, Any]) -> dict[str, Any]:
@@ -88,7 +128,5 @@ def _as_json(origin: Mapping[str, Any]) -> dict[str, Any]:
     return dict(json.loads(json.dumps(dict(origin), default=str)))
 
 
-def _list(parts: Mapping[str, Any], name: str) -> DecisionList | None:
-    if f"{name}_conditions" not in parts:
-        return None
+def _list(parts: Mapping[str, Any], name: str) -> DecisionList:
     return DecisionList(parts[f"{name}_conditions"], parts[f"{name}_controllers"])

@@ -22,8 +22,8 @@ def fine_tune(
     n_steps: int,
     seed: int,
     temperatures: tuple[float, float] = (0.3, 0.03),
-    learning_rate: float = 3e-3,
-    batch_size: int = 1024,
+    learning_rate: float = 1e-2,
+    batch_size: int = 512,
     keep_zeros: bool = False,
 ) -> DecisionList:
     """Return the list after Adam on the expected loss of the branch drawn by the conditions' sigmoids.
@@ -61,7 +61,7 @@ def fine_tune(
         rows = th.randint(len(data), (batch_size,), generator=generator)
         outputs = th.einsum("nd,kod->nko", inputs[rows], controllers)
         losses = loss.expected(outputs, targets[rows])
-        chances = _branch_chances(inputs[rows] @ conditions.T / (first * (last / first) ** done))
+        chances = branch_chances(inputs[rows] @ conditions.T / (first * (last / first) ** done))
         objective = ((chances * losses).sum(dim=1) * weights[rows]).mean()
         optimizer.zero_grad()
         objective.backward()
@@ -73,7 +73,7 @@ def fine_tune(
     return DecisionList(conditions.detach().double().numpy(), controllers.detach().double().numpy())
 
 
-def _branch_chances(values: th.Tensor) -> th.Tensor:
+def branch_chances(values: th.Tensor) -> th.Tensor:
     """Return how likely each branch acts, ``(n, n_branches)``, for the conditions' values ``(n, n_branches - 1)``."""
     import torch as th
 

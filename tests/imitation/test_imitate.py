@@ -16,10 +16,11 @@ from progpolicy_envs.panda import PandaStackEnv
 from sb3_progpolicy import compare_with_teacher, evaluate_program, imitate, load_pretrained
 from sb3_progpolicy.cli import run
 from sb3_progpolicy.imitation import algorithm, make_teacher
-from sb3_progpolicy.imitation.algorithm import training_variations
-from sb3_progpolicy.imitation.augmentation import taller_towers
+from sb3_progpolicy.imitation.augmentation import begun_towers, taller_towers
+from sb3_progpolicy.imitation.decision_list import DecisionList
 from sb3_progpolicy.imitation.learner import Settings
 from sb3_progpolicy.imitation.rollouts import STALL_WEIGHT, Collector, Pool, play
+from sb3_progpolicy.imitation.tasks import training_variations
 from sb3_progpolicy.interaction import VecInteractionHistory
 from sb3_progpolicy.programs import Program, ProgramRunner
 
@@ -71,6 +72,7 @@ def test_taller_towers_are_labelled_by_the_scripted_controller():
     names = PandaStackEnv.observation_names
     place = {name: index for index, name in enumerate(names)}
     low = np.zeros((400, len(names)), np.float32)
+    low[:, [place["distance"], place["target_dx"]]] = 0.2
     raised = taller_towers(names)(low, np.random.default_rng(0))
     assert (raised[:, place["target_z"]] > 0.03).all()
     moved = {names[column] for column in np.flatnonzero((raised != low).any(axis=0))}
@@ -78,10 +80,41 @@ def test_taller_towers_are_labelled_by_the_scripted_controller():
     for way, thing in (("target_dz", "target_z"), ("object_dz", "object_z")):
         difference = raised[:, place[thing]] - raised[:, place["gripper_z"]]
         np.testing.assert_allclose(raised[:, place[way]], difference, atol=1e-6)
+    low[:, place["distance"]] = 0.0  # a block in its place goes with the tower
+    raised = taller_towers(names)(low, np.random.default_rng(0))
+    assert (raised[:, place["object_z"]] == raised[:, place["target_z"]]).all()
+    low[:, place["target_dx"]] = 0.0  # near the tower there are more of them, and the hand over it goes with it
+    raised = taller_towers(names)(low, np.random.default_rng(0))
+    assert len(raised) == 3 * len(low)
+    assert {names[column] for column in np.flatnonzero(raised.any(axis=0))} == {"gripper_z", "target_z", "object_z"}
     with pytest.raises(ValueError, match="has no gripper_z"):
         imitate("planner", "Stacking-v0", augment="taller_towers")
     with pytest.raises(ValueError, match="needs more than an observation"):
         imitate("planner", "Stacking-v0", augment=lambda observations, rng: observations, **SMALL)
+
+
+def test_begun_towers_are_finished_and_the_blocks_of_the_variation_are_not():
+    with Pool("PandaStack-v0", 12, begin=begun_towers) as pool:
+        done = []
+        for row in range(12):
+            pool.reset(row, 100 + row, {"n_objects": 2})
+            finished = pool.envs[row].unwrapped.task.finished
+            assert finished[-2:] == [False, False]
+            assert all(finished[:-2])
+            done.append(len(finished) - 2)
+        assert {0, 4} <= set(done) <= {0, 1, 2, 3, 4}
+        heights = pool.observations[:, list(PandaStackEnv.observation_names).index("target_z")]
+        np.testing.assert_allclose(heights, 0.02 + 0.04 * np.array(done), atol=1e-6)
+        first = pool.observations[0].copy()
+        pool.reset(0, 100, {"n_objects": 2})
+        np.testing.assert_array_equal(pool.observations[0], first)
+        pool.reset(0, 101, {"n_objects": 1})
+        with pytest.raises(ValueError, match="n_done=7 is not accepted"):
+            pool.envs[0].unwrapped.begin_tower(7)
+    with pytest.raises(ValueError, match="only PandaStack has towers"):
+        imitate("planner", "PandaPush-v0", augment="begun_towers", **SMALL)
+    with pytest.raises(ValueError, match="begun_towers"):
+        imitate("planner", "PandaPush-v0", augment="begun_tower", **SMALL)
 
 
 def test_same_seed_gives_the_same_program(balanced):
@@ -98,21 +131,37 @@ def test_box_actions_are_in_the_unit_of_the_environment():
     np.testing.assert_allclose(acted, swing(observations), atol=0.15)
 
 
-def test_interrupted_imitation_goes_on(tmp_path, monkeypatch):
+def test_interrupted_imitation_goes_on_as_if_nothing_had_happened(balanced, tmp_path):
     state, seen = tmp_path / "state.npz", []
 
     def interrupt(so_far):
         seen.append(so_far.round)
-        if so_far.round == 6:
+        if so_far.round in (2, 6, 11):
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        imitate(balance, "CartPole-v1", callback=interrupt, checkpoint=state, **SMALL)
-    program = imitate(balance, "CartPole-v1", callback=interrupt, checkpoint=state, **SMALL)
-    assert seen == [*range(1, 7), *range(7, 12)]
-    assert program.metadata["labelled_states"] == 12 * 8 * (2000 // (12 * 8))
+    for _ in range(3):
+        with pytest.raises(KeyboardInterrupt):
+            imitate(balance, "CartPole-v1", seed=1, callback=interrupt, checkpoint=state, **SMALL)
+    program = imitate(balance, "CartPole-v1", seed=1, callback=interrupt, checkpoint=state, **SMALL)
+    assert seen == [*range(1, 13)]
+    assert program == balanced
+    assert program.metadata["labelled_states"] == 13 * (2000 // 13)
     with pytest.raises(ValueError, match="remove it to begin anew"):
         imitate(balance, "CartPole-v1", seed=9, checkpoint=state, **SMALL)
+
+
+def test_branches_that_hardly_ever_act_go_while_episodes_stay_as_good():
+    with Pool("CartPole-v1", 8) as pool:
+        run = algorithm._Run(pool, balance, "CartPole-v1", None, 0, 3, (), 8, 0.015, None)
+        states = np.random.default_rng(0).normal(scale=0.1, size=(500, 4)).astype(np.float32)
+        run.learner.add(states, run.codec.encode(balance(states)), np.ones(500))
+        rule = np.array([[-0.1, -0.5, -1, -1, 0], [0.1, 0.5, 1, 1, 0]]) * 20
+        rare = DecisionList(np.array([[0, 0, 0, 0, -1.0], [0, 0, 0, 0, 1.0]]), np.array([rule, rule, rule]))
+        run.best = run._score(rare), rare
+        run._drop_rare_branches()
+    assert run.learner.rare_branches(rare, 0.03) == [0, 2]
+    assert run.best[1].n_branches == 1
+    assert run.result["return"] == 500
 
 
 def test_planner_is_imitated_on_training_variations_only(monkeypatch):
@@ -135,7 +184,7 @@ def test_planner_is_imitated_on_training_variations_only(monkeypatch):
         ({"teacher": "expert"}, "'expert' is not accepted; it is 'planner'"),
         ({"teacher": 3}, "teacher=3 is not accepted"),
         ({"teacher": "planner"}, "CartPole-v1 has no planner"),
-        ({"cell": "gru"}, "cell='gru' is not accepted"),
+        ({"cell": "lstm"}, "cell='lstm' is not accepted"),
         ({"n_timesteps": 5}, "n_timesteps=5"),
         ({"tasks": []}, "at least one variation"),
         ({"env_id": "CartPol-v1"}, "unknown environment"),

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sb3_progpolicy import load_pretrained
 from sb3_progpolicy.programs import (
     ActionSpec,
     Condition,
@@ -226,7 +227,7 @@ def test_text_of_a_small_program_reads_like_this():
 
 def test_whole_numbers_are_printed_without_a_point():
     assert export_text(program_by_hand()).partition("\n\n")[2] == (
-        "if B1 >= 0:\n"
+        "if B1 = 1 - 2*position >= 0:\n"
         "    left  = 0\n"
         "    stay  = 0\n"
         "    right = 1\n"
@@ -234,8 +235,6 @@ def test_whole_numbers_are_printed_without_a_point():
         "    left  = -5*[previous left] - angle[0]\n"
         "    stay  = 2\n"
         "    right = -1 + 3*angle[0]\n"
-        "\n"
-        "B1 = 1 - 2*position\n"
     )
     assert "left = 0  -5 previous left  -angle[0]\\l" in export_graphviz(program_by_hand())
     assert "0 & -1 & 0 & 0 & -5 & 0" in export_latex(program_by_hand())
@@ -263,6 +262,26 @@ def test_every_print_counts_what_it_leaves_out_or_shows_that_it_is_there():
     assert "… 1" in [text.get_text() for text in axes.texts]
     matplotlib.pyplot.close(axes.figure)
     assert "smaller" not in export_text(program, decimals=3)
+
+
+def test_numbers_of_a_box_action_share_lines_where_they_fit():
+    program = load_pretrained("PandaPush-v0")
+    text = export_text(program, max_terms=None)
+    lines = text.splitlines()
+    assert max(map(len, lines)) <= 100
+    assert sum(map(bool, lines)) < 40
+    outputs = [part for line in lines if line.startswith("    ") for part in line.strip().split(";  ")]
+    assert len([part for part in outputs if " = " in part]) == 4 * len(program.controllers)
+
+
+def test_condition_that_does_not_fit_into_its_line_stands_below():
+    program = replace(program_by_hand(), input_names=("an angle with a long name" * 5, *"abcdefgh"))
+    program = replace(
+        program,
+        body=replace(program.body, condition=replace(program.body.condition, readout=(1.0,) + (0.0,) * 8)),
+    )
+    assert "if B1 >= 0:" in export_text(program)
+    assert "\n\nB1 = 1" in export_text(program)
 
 
 def test_name_that_is_a_number_is_not_read_as_one():

@@ -20,6 +20,7 @@ def briefly_trained(cell, depth):
         n_steps=32,
         learning_rate=0.02,
         length_coef=0.0,
+        normalize_observations=False,
         policy_kwargs={"depth": depth, "cell": cell, "condition_size": 2},
         seed=0,
         device="cpu",

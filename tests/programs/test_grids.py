@@ -97,7 +97,7 @@ def test_tables_of_conditions():
     weights = (*np.ravel(OTHER).astype(float).tolist(), 0.0)
     affine = Condition("affine", (), (), (), (), weights, 1.0)
     switch = Condition("switch", (weights, (0.0,) * 7), ((0.0,), (0.0,)), (0.0, 1.0), (0.0, 0.0), (1.0,), -0.5)
-    for condition, shown in ((affine, "B1 = table*(T1) + 1\n"), (switch, "on when  table*(T1) >= 0\n")):
+    for condition, shown in ((affine, "B1 = table*(T1) + 1 >= 0:\n"), (switch, "on when  table*(T1) >= 0\n")):
         one = program(np.zeros((2, 3)), 1.0)
         one = dataclasses.replace(one, body=IfThenElse(condition, one.body, one.body))
         assert shown in export_text(one)

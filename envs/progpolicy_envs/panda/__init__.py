@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import ClassVar
 
+import numpy as np
+
 from progpolicy_envs.documentation import with_sections
-from progpolicy_envs.panda.env import Action, FlatObservation, PandaEnv
+from progpolicy_envs.panda.env import Action, FlatObservation, Observation, PandaEnv
 from progpolicy_envs.panda.goal import EntryPoint, PandaGoalEnv
 from progpolicy_envs.panda.physics import MAX_OBJECTS, PANDA_GYM_PHYSICS, Physics
 from progpolicy_envs.panda.sections import SECTIONS
 from progpolicy_envs.panda.tasks import Push, Reach, Slide, Stack, Task
 from progpolicy_envs.planners import panda as controllers
+from progpolicy_envs.single import require_reset
 from progpolicy_envs.variation import IntParameter, VariationSpace
 
 __all__ = [
@@ -255,6 +258,24 @@ class PandaStackEnv(_ObjectsEnv):
 
     task_class: ClassVar[type[Task]] = Stack
     controller: ClassVar[Callable[[FlatObservation], Action]] = staticmethod(controllers.stack)
+
+    def begin_tower(self, n_done: int) -> Observation:
+        """Begin the episode once more with the first blocks in their places, as if they had been stacked.
+
+        :param n_done: how many, fewer than there are
+        :return: the observation
+        :raises ValueError: if there are not so many blocks
+        """
+        require_reset(self._started, "begin_tower()")
+        n_objects = len(self.task.targets)
+        if not 0 <= n_done < n_objects:
+            raise ValueError(f"n_done={n_done} is not accepted; of {n_objects} blocks 0 to {n_objects - 1} can be done")
+        starts, targets = np.array(self.task.starts), np.array(self.task.targets)
+        starts[:n_done] = targets[:n_done]
+        self.task.place(self.scene, starts, targets)
+        self.task.update(self.scene)
+        self._update_focus()
+        return self._observation()
 
 
 class PandaReachGoalEnv(PandaGoalEnv, PandaReachEnv):

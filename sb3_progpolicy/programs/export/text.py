@@ -36,7 +36,8 @@ def export_text(program: ProgramData, decimals: int = 2, max_terms: int | None =
     """Print a program as an indented if-then-else that a person can read.
 
     The terms of every sum stand in order of size. Those that round to zero or come after ``max_terms`` are only
-    counted. Whole numbers are printed without a point, so that ``3`` is exact and ``3.00`` is rounded.
+    counted. An affine condition stands in the line of its branch, and several numbers of a Box action in one line,
+    where they fit. Whole numbers are printed without a point, so that ``3`` is exact and ``3.00`` is rounded.
     :func:`export_python` and the saved file hold all numbers in full.
 
     :param program: what to print
@@ -58,7 +59,8 @@ class _TextPrinter(ProgramVisitor[list[str]]):
     def print(self) -> str:
         lines = [*self._heading(), "", *self.visit(self.program.body)]
         for index, condition in enumerate(self.program.conditions):
-            lines += ["", *self._condition(condition, index)]
+            if self._inline(condition, index) is None:
+                lines += ["", *self._condition(condition, index)]
         lines += self._legend("\n".join(lines))
         cells = sorted({condition.cell for condition in self.program.conditions} & set(_RULES))
         if cells:
@@ -70,8 +72,8 @@ class _TextPrinter(ProgramVisitor[list[str]]):
         return "\n".join(lines) + "\n"
 
     def visit_branch(self, branch: IfThenElse, index: int) -> list[str]:
-        word = "else if" if index else "if"
-        return [f"{word} B{index + 1} >= 0:", *self._lines(branch.then), *self.visit(branch.orelse, index + 1)]
+        heading = self._inline(branch.condition, index) or f"{_word(index)} B{index + 1} >= 0:"
+        return [heading, *self._lines(branch.then), *self.visit(branch.orelse, index + 1)]
 
     def visit_controller(self, controller: Controller, index: int) -> list[str]:
         return ["else:" if index else "always:", *self._lines(controller)]
@@ -101,12 +103,25 @@ class _TextPrinter(ProgramVisitor[list[str]]):
 
     def _lines(self, controller: Controller) -> list[str]:
         names = [_set_apart(name) if "=" in name else name for name in self.program.output_names]
-        width = max(len(name) for name in names)
-        lines = []
+        packed = self.program.action.kind == "box"
+        width = 0 if packed else max(len(name) for name in names)
+        lines: list[str] = []
         for name, constant, weights in zip(names, controller.bias, controller.weights, strict=True):
-            start = f"{INDENT}{name.ljust(width)} = "
-            lines += self._inputs_sum(start, constant, weights)
+            added = self._inputs_sum(f"{INDENT}{name.ljust(width)} = ", constant, weights)
+            if packed and lines and len(added) == 1 and len(lines[-1]) + len(added[0]) - len(INDENT) + 3 <= WIDTH:
+                lines[-1] += f";  {added[0].lstrip()}"
+            else:
+                lines += added
         return lines
+
+    def _inline(self, condition: Condition, index: int) -> str | None:
+        """Return the line that begins a branch with its condition written out, if it is affine and fits."""
+        if condition.cell != "affine":
+            return None
+        start = f"{_word(index)} "
+        lines = self._inputs_sum(f"{start}B{index + 1} = ", condition.readout_bias, condition.readout)
+        heading = f"{lines[0]} >= 0:"
+        return heading if len(lines) == 1 and len(heading) <= WIDTH else None
 
     def _inputs_sum(self, start: str, constant: float, weights: Sequence[float], close: str = "") -> list[str]:
         """A sum over X, its grids as functions of row and column or as tables where they are such."""
@@ -186,6 +201,10 @@ class _TextPrinter(ProgramVisitor[list[str]]):
         if terms.n_dropped:
             tokens.append(f"{'+ ' if tokens else ''}({counted(terms.n_dropped, 'smaller term')})")
         return tokens or ["0"]
+
+
+def _word(index: int) -> str:
+    return "else if" if index else "if"
 
 
 def _set_apart(name: str) -> str:
