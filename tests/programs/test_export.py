@@ -240,19 +240,6 @@ def test_whole_numbers_are_printed_without_a_point():
     assert "0 & -1 & 0 & 0 & -5 & 0" in export_latex(program_by_hand())
 
 
-def test_whole_numbers_keep_their_form_beside_others_and_what_only_rounds_to_one_has_a_point():
-    for weight, printed in ((-0.5, "0.50*"), (-2.999, "3.00*"), (-3.0, "3*"), (-1.001, "1.00*"), (-1.0, "")):
-        text = export_text(program_by_hand(weight))
-        assert f"    left  = -5*[previous left] - {printed}angle[0]\n" in text
-        assert "    right = -1 + 3*angle[0]\n" in text
-    assert "0 & -0.50 & 0 & 0 & -5 & 0" in export_latex(program_by_hand(-0.5))
-    assert "left = 0  -5 previous left  -0.50 angle[0]\\l" in export_graphviz(program_by_hand(-0.5))
-    axes = plot_program(program_by_hand(-0.5), decimals=2)
-    texts = {text.get_text() for text in axes.texts}
-    matplotlib.pyplot.close(axes.figure)
-    assert {"\N{MINUS SIGN}0.50 angle[0]", "\N{MINUS SIGN}5 previous left", "+3 angle[0]"} <= texts
-
-
 def test_every_print_counts_what_it_leaves_out_or_shows_that_it_is_there():
     program = program_by_hand(-0.001)
     assert "left  = -5*[previous left] + (1 smaller term)" in export_text(program)

@@ -61,6 +61,16 @@ def test_text():
     )
 
 
+@pytest.mark.parametrize(("constant", "often"), [(-1.0, "never"), (0.0, "always")])
+def test_what_reads_nothing_happens_always_or_never(constant, often):
+    latch = dataclasses.replace(SWITCH, weight_ih=(SWITCH.weight_ih[0], (0.0,) * 3), bias_ih=(-1.0, constant))
+    assert f"    on when  -1 + 2*rises >= 0\n    off {often}\n" in export_text(program(latch))
+    assert f"\\noff {often}" in export_graphviz(program(latch))
+    axes = plot_program(program(latch))
+    assert f"off {often}" in [text.get_text() for text in axes.texts]
+    matplotlib.pyplot.close(axes.figure)
+
+
 def test_text_of_switches_that_read_each_other():
     two = dataclasses.replace(
         SWITCH, weight_ih=SWITCH.weight_ih * 2, weight_hh=((0.0, 0.0), (0.0, 3.0), (0.0, 0.0), (0.0, 0.0)),

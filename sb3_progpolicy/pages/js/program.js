@@ -128,7 +128,11 @@ class ProgramView {
   // A switch alone: what turns it on and off. It is off at first.
   switches({ weightIh, biasIh, biasHh }) {
     const lines = ["on", "off"].map((name, i) => {
-      const sum = formula(biasIh[i] + biasHh[i], weightIh[i], this.program.inputNames, this.most(), this.grids);
+      const constant = biasIh[i] + biasHh[i];
+      if (weightIh[i].every((weight) => weight === 0)) {
+        return make("div", { class: "sum" }, `${name} ${constant >= 0 ? "always" : "never"}`);
+      }
+      const sum = formula(constant, weightIh[i], this.program.inputNames, this.most(), this.grids);
       return make("div", { class: "sum" }, `${name} when `, sum, "\u2265 0");
     });
     return make("div", {}, lines);

@@ -11,6 +11,7 @@ from sb3_progpolicy.programs.export.visitor import (
     CELL_NAMES,
     Decimals,
     ProgramVisitor,
+    always_or_never,
     counted,
     deliver,
     input_importance,
@@ -93,7 +94,10 @@ class _DotPrinter(ProgramVisitor[list[str]]):
             return [
                 f"B{index + 1} >= 0 ?",
                 f"B{index + 1} = {self.number(while_on)} while on, {self.number(while_off)} while off",
-                *(f"{name} when  {self._inputs_sum(*of_x)}  >= 0" for name, of_x in switch_sums(condition)),
+                *(
+                    f"{name} {always_or_never(*of_x) or f'when  {self._inputs_sum(*of_x)}  >= 0'}"
+                    for name, of_x in switch_sums(condition)
+                ),
                 *map(_apart, self.tables.new_lines()),
             ]
         units = [f"h{unit + 1}" for unit in range(condition.hidden_size)]

@@ -11,6 +11,7 @@ from sb3_progpolicy.programs.export.visitor import (
     CELL_NAMES,
     Decimals,
     ProgramVisitor,
+    always_or_never,
     counted,
     input_importance,
     is_switch,
@@ -154,8 +155,11 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
     def _switch(self, condition: Condition, index: int) -> _Card:
         while_on, while_off = condition.readout_bias + condition.readout[0], condition.readout_bias
         values = f"B{index + 1} = {self.number(while_on)} while on, {self.number(while_off)} while off"
-        rows = []
+        rows: list[tuple[tuple[str, str, int], ...]] = []
         for name, (constant, weights) in switch_sums(condition):
+            if often := always_or_never(constant, weights):
+                rows.append(((f"{name} {often}", INK, 0),))
+                continue
             shown, terms = self._terms(constant, *self._collapsed(weights))
             rows.append(_in_a_row(f"{name + ' when':<8} {shown}", [*terms, ("≥ 0", INK)]))
         return _Card((_head(index), ((values.replace("-", MINUS), QUIET, 0),), *rows, *self._new_tables()))

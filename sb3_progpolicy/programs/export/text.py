@@ -10,6 +10,7 @@ from sb3_progpolicy.programs.export.visitor import (
     Decimals,
     ProgramVisitor,
     action_rule,
+    always_or_never,
     counted,
     gate_names,
     is_switch,
@@ -142,7 +143,9 @@ class _TextPrinter(ProgramVisitor[list[str]]):
             while_on, while_off = condition.readout_bias + condition.readout[0], condition.readout_bias
             lines = [f"{start}{self.number(while_on)} while on, {self.number(while_off)} while off"]
             for name, (constant, weights) in switch_sums(condition):
-                lines += self._inputs_sum(f"{INDENT}{name + ' when':<9}", constant, weights, " >= 0")
+                often = always_or_never(constant, weights)
+                start = f"{INDENT}{name + ' when':<9}"
+                lines += [f"{INDENT}{name} {often}"] if often else self._inputs_sum(start, constant, weights, " >= 0")
             return lines
         units = [f"h{unit + 1}" for unit in range(size)]
         lines = self._sum(start, condition.readout_bias, condition.readout, units)

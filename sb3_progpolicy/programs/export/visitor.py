@@ -127,6 +127,11 @@ def switch_sums(condition: Condition) -> list[tuple[str, tuple[float, Sequence[f
     return list(zip(GATES["switch"], zip(constants, condition.weight_ih, strict=True), strict=True))
 
 
+def always_or_never(constant: float, weights: Sequence[float]) -> str | None:
+    """How often a sum that reads nothing is not below 0, ``"always"`` or ``"never"``; ``None`` if it reads."""
+    return None if any(weights) else "always" if constant >= 0 else "never"
+
+
 def gate_names(condition: Condition) -> list[tuple[str, int]]:
     """The gate and the unit that each row of a condition's weights belongs to."""
     return [(gate, unit) for gate in GATES[condition.cell] for unit in range(condition.hidden_size)]
