@@ -32,7 +32,7 @@ def make(env="Hanoi-v0", policy="ProgPolicy", **kwargs):
 
 @pytest.mark.parametrize("policy", ["ProgPolicy", "PRLPolicy", "MlpPolicy", "MlpLstmPolicy"])
 def test_a_plain_environment_is_evaluated_as_one_with_the_history(tmp_path, policy):
-    model = make(policy=policy, learning_rate=0.0)
+    model = make(policy=policy, learning_rate=0.0, normalize_observations=False)
     callback = InteractionEvalCallback(
         hanoi(), n_eval_episodes=3, eval_freq=16, log_path=tmp_path, best_model_save_path=tmp_path, verbose=0
     )

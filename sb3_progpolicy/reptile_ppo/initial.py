@@ -91,7 +91,7 @@ def initial_policy_kwargs(program: Program, policy: type[BasePolicy], given: Map
         )
     if given.get("symmetries"):
         raise ValueError(
-            "init_program is not accepted with symmetric=True; its weights need not be tied. Train it without"
+            "init_program is not accepted with symmetric=True; its weights need not be tied. Give symmetric=False"
         )
     shape = shape_of(program)
     fitting: dict[str, Any] = {"temperature": _temperature(program)}

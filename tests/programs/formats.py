@@ -91,7 +91,15 @@ def check_text(program: Program) -> None:
     """The lines that are not indented, up to their first sum, are those of a plain program."""
     lines, plain = (export_text(p).split("\n")[1:] for p in (program, with_plain_texts(program)))
     assert all(line.isprintable() for line in lines)
-    heads, expected = ([line.split(" = ")[0] for line in part if line[:1] != " "] for part in (lines, plain))
+    # A condition stands in the line of its branch where it fits, which depends on the names, or in a line of its own.
+    heads, expected = (
+        [
+            re.split(r" = | >= ", line)[0]
+            for line in part
+            if line.strip() and line[0] != " " and not re.match(r"B\d+ = ", line)
+        ]
+        for part in (lines, plain)
+    )
     assert heads == expected
 
 
