@@ -73,7 +73,7 @@ def test_training_starts_from_a_program(tmp_path, capsys):
     assert learned.learned_by == "imitation+reinforcement"
     assert len(learned.conditions) == len(program.conditions)
     np.testing.assert_allclose(learned.controllers[0].weights, program.controllers[0].weights, atol=0.4)
-    again = train(tmp_path / "again", "-n", "64", "-i", str(folder))
+    again = train(tmp_path / "again", "-n", "64", "-i", str(folder), *options[4:])
     assert load_program(again / "program.json").learned_by == "imitation+reinforcement", "-i takes it over"
     assert run(["train", "-f", str(tmp_path), "--init-program", "Hanoi-v9"]) == 2
     assert "Hanoi-v0" in capsys.readouterr().err
