@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from itertools import groupby
@@ -246,7 +246,7 @@ def _evaluate(
     arguments = dict(env_kwargs or {})
     # Parameters that a domain's environment reads as options are known; another's constructor may be where they go.
     by_constructor = (
-        set().union(*(constructor_arguments(env_id, variation, arguments) for variation in variations))
+        set().union(*(constructor_arguments(env_id, one, arguments) for one in _one_of_each_kind(variations)))
         if domain is None
         else set[str]()
     )
@@ -273,6 +273,11 @@ def _evaluate(
             for row, variation in enumerate(group)
         ]
     return rows
+
+
+def _one_of_each_kind(variations: Sequence[Mapping[str, Any]]) -> Iterable[Mapping[str, Any]]:
+    """Return one variation for each set of names."""
+    return {frozenset(variation): variation for variation in variations}.values()
 
 
 def _groups(variations: Sequence[Mapping[str, Any]], batched: bool) -> Iterator[list[Mapping[str, Any]]]:

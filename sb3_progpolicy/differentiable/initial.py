@@ -36,6 +36,8 @@ def put_program(module: ProgramModule, program: ProgramData) -> None:
     :param program: what it is to compute
     :raises ValueError: if the program does not fit
     """
+    if module.group is not None:
+        raise ValueError("a module whose weights are tied over symmetries is not accepted; a program's need not be")
     n_conditions, shape, has = len(program.conditions), shape_of(program), module.conditions
     if program.n_inputs > module.n_inputs or program.action.sizes != module.action.sizes:
         raise ValueError(

@@ -192,7 +192,10 @@ class ProgramModule(nn.Module):
 
     def controller_parameters(self) -> tuple[th.Tensor, th.Tensor]:
         """Return weights and biases of all controllers, of logits by the action temperature."""
-        weight, bias = self.controllers.weight, self.controllers.bias
+        if isinstance(self.controllers, TiedLinear):
+            weight, bias = self.controllers.expand()
+        else:
+            weight, bias = self.controllers.weight, self.controllers.bias
         if self.action.kind == "box":
             return weight, bias
         return weight / self.action_temperature, bias / self.action_temperature

@@ -29,16 +29,18 @@ class TiedLinear(nn.Module):
     @property
     def weight(self) -> th.Tensor:
         """``(n_maps * n_outputs, n_inputs)``."""
-        return self._expand()[:, :-1]
+        return self.expand()[0]
 
     @property
     def bias(self) -> th.Tensor:
         """``(n_maps * n_outputs,)``."""
-        return self._expand()[:, -1]
+        return self.expand()[1]
 
-    def _expand(self) -> th.Tensor:
+    def expand(self) -> tuple[th.Tensor, th.Tensor]:
+        """Return weights and biases, both of one computation."""
         weights = self.free.index_select(1, self._index).unflatten(1, self._sign.shape) * self._sign
-        return weights.flatten(0, 1)
+        rows = weights.flatten(0, 1)
+        return rows[:, :-1], rows[:, -1]
 
     @th.no_grad()
     def orthogonal_(self, gain: float) -> None:

@@ -272,5 +272,8 @@ def test_names_in_another_order_are_warned_of():
 
 
 def test_program_whose_weights_need_not_be_tied_is_refused():
+    tied = make(env="Hanoi-v0", symmetric=True).policy.module
+    with pytest.raises(ValueError, match="tied over symmetries is not accepted"):
+        put_program(tied, load_pretrained("Hanoi-v0"))
     with pytest.raises(ValueError, match="init_program is not accepted with symmetric=True"):
         make(env="Hanoi-v0", init_program="Hanoi-v0", symmetric=True)
