@@ -223,7 +223,7 @@ def test_inputs_of_an_unknown_environment_are_set_by_hand_and_the_program_rememb
 def test_a_page_of_mostly_zero_weights_shows_the_others_only(visit, tab):
     program = load_pretrained("Hanoi-v0")
     weights = np.array(program.body.weights)
-    weights[np.abs(weights) < 3] = 0
+    weights[np.abs(weights) < 1.5] = 0
     body = replace(program.body, weights=tuple(map(tuple, weights.tolist())), bias=(0.0,) * 6)
     visit(replace(program, body=body))
     assert tab.evaluate("document.querySelectorAll('.leaf .term').length") == np.count_nonzero(weights)
