@@ -150,7 +150,7 @@ def _print_summary(found: Simplification, rows: list[dict[str, object]], env_id:
     words = (
         "no program of this form has fewer"
         if bound == found.terms_after
-        else f"none of this form has less than {bound}"
+        else (f"none of this form has less than {bound}" if bound else "fewer may do")
     )
     tied = f", one rule for all {found.symmetry}" if found.symmetry else ""
     console.print(
