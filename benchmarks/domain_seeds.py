@@ -1,79 +1,216 @@
-"""Several seeds on any domain: train on its training variations, then run the programs on those never seen.
+"""Several seeds of a domain, or of any environment: train on its training variations, then run the programs.
 
-    python benchmarks/domain_seeds.py --env PandaReach-v0 [--seeds 5] [--episodes 20]
+    python benchmarks/domain_seeds.py --env HikingEgo-v0 [--seeds 10] [--episodes 100] [--workers 1]
+    python benchmarks/domain_seeds.py --env HikingEgo-v0 --final --ship
+    python benchmarks/domain_seeds.py --env Acrobot-v1
 
 Each seed trains from scratch with ``sb3_progpolicy/hyperparams/reptile_ppo.yml``, the same for all. Its program is then
-run as a real if-then-else (crisp) on every training and every unseen variation, on starts that training did not use. A
-finished seed is kept in ``runs/``, so that an interrupted study goes on where it was.
+run, crisp and soft, on every training and validation variation, on starts that training did not use. With --final it is run on the unseen variations, too, which nothing is chosen by. A finished seed is kept in
+``runs/`` and one that is interrupted goes on from its last checkpoint.
 
-Writes ``benchmarks/results/<name>.csv`` and a ``.json`` with command, commit and versions.
+Writes ``benchmarks/results/<name>.csv``, a picture of the crisp programs, and a ``.json`` with command, commit and
+versions. Says which seed is the median by what was reached in training; --ship puts it into the package.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
+import multiprocessing
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.progress import track
-from study import train, write_results
+from study import RESULTS, commit, train, write_results
 
-from progpolicy_envs import DOMAINS
-from sb3_progpolicy.evaluation import evaluate_program
+import sb3_progpolicy.pretrained
+from progpolicy_envs import find_domain
+from sb3_progpolicy.evaluation import Evaluation, evaluate_program, spec_of
+from sb3_progpolicy.imitation.rollouts import Pool, play, program_act
+from sb3_progpolicy.programs import Program
+from sb3_progpolicy.programs.files import write_atomically
 
-COLUMNS = ("seed", "set", "variation", "episodes", "success_rate", "steps_mean", "n_conditions", "train_seconds")
+COLUMNS = (
+    *("seed", "set", "variation", "semantics", "episodes", "success_rate", "steps_mean", "ratio", "return_mean"),
+    *("n_conditions", "timesteps", "train_seconds"),
+)
+SEMANTICS = ("crisp", "soft")
 EVALUATION_SEED = 10_000
+Row = dict[str, Any]
 
 
-def run_seed(env_id: str, seed: int, folder: Path, overrides: dict[str, Any], episodes: int) -> list[dict[str, Any]]:
+def run_seed(job: tuple[str, int, Path, dict[str, Any], int, bool]) -> list[Row]:
     """Train and evaluate one seed."""
+    env_id, seed, folder, overrides, episodes, final = job
     program = train(env_id, seed, folder, overrides)
-    domain = DOMAINS[env_id]
+    rows = returns_of(program, env_id, episodes) if find_domain(env_id) is None else []
+    rows = rows or list(results_of(program, env_id, episodes, final))
+    about = {
+        "seed": seed,
+        "n_conditions": len(program.conditions),
+        "timesteps": program.metadata["timesteps"],
+        "train_seconds": program.metadata["train_seconds"],
+    }
+    return [{**about, **row} for row in rows]
+
+
+def results_of(program: Program, env_id: str, episodes: int, final: bool) -> Iterable[Row]:
+    """Run a program on the variations of its domain."""
+    domain = find_domain(env_id)
+    assert domain is not None
+    sets = {"train": domain.trained, "validation": domain.validation, **({"unseen": domain.unseen} if final else {})}
+    for kind, variations in sets.items():
+        for semantics in SEMANTICS:
+            for row in evaluate_program(
+                program, env_id, variations, episodes, semantics=semantics, seed=EVALUATION_SEED
+            ):
+                yield {"set": kind, **_row(row)}
+
+
+def _row(row: Evaluation) -> Row:
+    return {
+        "variation": ", ".join(f"{name}={value}" for name, value in row.variation.items()),
+        "semantics": row.semantics,
+        "episodes": row.episodes,
+        "success_rate": row.success_rate,
+        "steps_mean": round(row.steps_mean, 2),
+        "ratio": "" if row.ratio is None else round(row.ratio, 3),
+        "return_mean": "",
+    }
+
+
+def returns_of(program: Program, env_id: str, episodes: int) -> list[Row]:
+    """Run a program on an environment that has returns and no variations."""
     rows = []
-    for kind, variations in (("train", domain.train), ("validation", domain.validation), ("unseen", domain.unseen)):
-        results = evaluate_program(program, env_id, variations, episodes, seed=EVALUATION_SEED)
-        rows += [
+    for semantics in SEMANTICS:
+        with Pool(env_id, min(episodes, 25), interaction=program.interaction) as pool:
+            played = play(pool, [{}], episodes, EVALUATION_SEED, program_act(program, len(pool), semantics))
+        rows.append(
             {
-                "seed": seed,
-                "set": kind,
-                "variation": ", ".join(f"{name}={value}" for name, value in row.variation.items()),
-                "episodes": row.episodes,
-                "success_rate": row.success_rate,
-                "steps_mean": round(row.steps_mean, 2),
-                "n_conditions": len(program.conditions),
-                "train_seconds": program.metadata["train_seconds"],
+                "set": "train",
+                "variation": "",
+                "semantics": semantics,
+                "episodes": episodes,
+                "success_rate": float(played.successes.mean()) if len(played.successes) else "",
+                "steps_mean": round(float(played.steps.mean()), 2),
+                "ratio": "",
+                "return_mean": round(float(played.returns.mean()), 2),
             }
-            for row in results
-        ]
+        )
     return rows
+
+
+def median_seed(rows: Sequence[Row]) -> int:
+    """Return the seed whose crisp program is the median by what it reached on the training variations."""
+    merits: dict[int, list[tuple[float, float]]] = {}
+    for row in rows:
+        if row["set"] == "train" and row["semantics"] == "crisp":
+            first = row["return_mean"] if row["success_rate"] == "" else row["success_rate"]
+            merits.setdefault(row["seed"], []).append((float(first), -float(row["steps_mean"])))
+    ranked = sorted(merits, key=lambda seed: tuple(np.mean(merits[seed], axis=0)))
+    return ranked[len(ranked) // 2]
+
+
+def plot(name: str, rows: Sequence[Row], title: str) -> None:
+    """Draw what each seed's crisp program reaches on each variation: success, and steps as a multiple of the planner's.
+
+    Where there is no success, the return.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    crisp = [row for row in rows if row["semantics"] == "crisp"]
+    labels = list(dict.fromkeys((row["set"], row["variation"]) for row in crisp))
+    columns = {"success_rate": "success", "ratio": "steps / planner's", "return_mean": "return"}
+    shown = [name for name in columns if any(row[name] != "" for row in crisp)]
+    height = 1.2 + 0.24 * len(labels)
+    figure, all_axes = plt.subplots(
+        1, len(shown), figsize=(3.6 + 3.2 * len(shown), height), layout="constrained", sharey=True, squeeze=False
+    )
+    colours = {"train": "#24598a", "validation": "#b9770e", "unseen": "#1e8449"}
+    for axes, column in zip(all_axes[0], shown, strict=True):
+        for place, (kind, variation) in enumerate(labels):
+            here = [row[column] for row in crisp if (row["set"], row["variation"]) == (kind, variation)]
+            values = [float(value) for value in here if value != ""]
+            axes.plot(values, [place] * len(values), "o", color=colours[kind], alpha=0.45, markersize=5)
+            if values:
+                axes.plot(np.median(values), place, "|", color=colours[kind], markersize=14)
+        axes.set(xlabel=columns[column])
+        axes.grid(axis="x", color="#dde3ea", linewidth=0.6)
+    all_axes[0][0].set_yticks(
+        range(len(labels)), [f"{variation or 'as trained'}  ({kind})" for kind, variation in labels]
+    )
+    all_axes[0][0].invert_yaxis()
+    figure.suptitle(title, fontsize=10)
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", dpi=100)
+    plt.close(figure)
+    write_atomically(RESULTS / f"{name}.png", picture.getvalue())
+
+
+def summarise(rows: Sequence[Row]) -> None:
+    """Print for each variation what the crisp programs reach."""
+    crisp = [row for row in rows if row["semantics"] == "crisp"]
+    for kind, variation in dict.fromkeys((row["set"], row["variation"]) for row in crisp):
+        here = [row for row in crisp if (row["set"], row["variation"]) == (kind, variation)]
+        parts = []
+        for column, form in (("success_rate", "{:.1%}"), ("ratio", "{:.2f}"), ("return_mean", "{:.1f}")):
+            values = [float(row[column]) for row in here if row[column] != ""]
+            if values:
+                spread = ", ".join(form.format(value) for value in (min(values), np.median(values), max(values)))
+                parts.append(f"{column} {spread}")
+        print(f"{variation or 'as trained'} ({kind}): {'; '.join(parts)} (least, median, most)")
+
+
+def ship(env_id: str, folder: Path, seed: int) -> None:
+    """Put the program of a seed into the package."""
+    name = f"{env_id.rpartition(':')[2]}.json"
+    target = Path(sb3_progpolicy.pretrained.__file__).with_name(name)
+    shutil.copy(folder / f"seed_{seed}.json", target)
+    print(f"seed {seed} is shipped as {name}")
+
+
+def overrides_from(pairs: Iterable[str]) -> Mapping[str, Any]:
+    """Return the hyperparameters that ``key:value`` texts give."""
+    from sb3_progpolicy.hyperparams import parse_value
+
+    return {key: parse_value(value) for key, _, value in (pair.partition(":") for pair in pairs)}
 
 
 def main() -> None:
     """Run the study."""
-    from sb3_progpolicy.hyperparams import parse_value
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", choices=list(DOMAINS), required=True, help="environment id")
-    parser.add_argument("--seeds", type=int, default=5, help="number of seeds, from 0 on")
-    parser.add_argument("--episodes", type=int, default=20, help="episodes on each variation")
+    parser.add_argument("--env", required=True, help="environment id")
+    parser.add_argument("--seeds", type=int, default=10, help="number of seeds, from 0 on")
+    parser.add_argument("--episodes", type=int, default=100, help="episodes on each variation")
+    parser.add_argument("--workers", type=int, default=1, help="seeds trained at the same time")
+    parser.add_argument("--final", action="store_true", help="look at the unseen variations, too")
+    parser.add_argument("--ship", action="store_true", help="put the median seed's program into the package")
     parser.add_argument("--name", help="name of the result files; that of the domain by default")
     parser.add_argument(
         "--hyperparams", nargs="*", default=[], metavar="KEY:VALUE", help="in place of the shipped ones"
     )
     options = parser.parse_args()
-    overrides = {key: parse_value(value) for key, _, value in (pair.partition(":") for pair in options.hyperparams)}
-    name = options.name or f"{options.env.rpartition('-')[0].lower()}_seeds"
-    rows: list[dict[str, Any]] = []
-    for seed in track(range(options.seeds), "Seeds"):
-        rows += run_seed(options.env, seed, Path("runs") / name, overrides, options.episodes)
+    spec_of(options.env)
+    commit()  # of the code that is loaded now
+    overrides = dict(overrides_from(options.hyperparams))
+    name = options.name or f"{options.env.rpartition(':')[2].rpartition('-')[0].lower()}_seeds"
+    folder = Path("runs") / name
+    jobs = [(options.env, seed, folder, overrides, options.episodes, options.final) for seed in range(options.seeds)]
+    with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
+        done = track(pool.imap(run_seed, jobs), "Seeds", total=len(jobs))
+        rows = [row for seed_rows in done for row in seed_rows]
     write_results(name, COLUMNS, rows, overrides)
-    for variation in dict.fromkeys(row["variation"] for row in rows):
-        here = [row for row in rows if row["variation"] == variation]
-        rates = [row["success_rate"] for row in here]
-        steps = np.mean([row["steps_mean"] for row in here])
-        success = f"success {np.mean(rates):.1%}, worst seed {min(rates):.0%}"
-        print(f"{variation} ({here[0]['set']}): {success}, {steps:.1f} steps")
+    plot(name, rows, f"{options.env}: {options.seeds} seeds, crisp programs, {options.episodes} episodes each")
+    summarise(rows)
+    print(f"the median seed by what was reached in training: {median_seed(rows)}")
+    if options.ship:
+        ship(options.env, folder, median_seed(rows))
 
 
 if __name__ == "__main__":

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import json
 import platform
+import shutil
 import subprocess
 import sys
 import time
@@ -16,24 +18,29 @@ from pathlib import Path
 from typing import Any
 
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_progpolicy.experiment.config import make_config
-from sb3_progpolicy.experiment.run import build_model
+from sb3_progpolicy.experiment.folder import CONFIG, describe_run
+from sb3_progpolicy.experiment.run import TrainingOptions, build_model, resume
+from sb3_progpolicy.experiment.run import train as train_run
 from sb3_progpolicy.programs import Program
 from sb3_progpolicy.programs.files import write_atomically
 
 RESULTS = Path(__file__).parent / "results"
+SAVE_FREQ = 250_000  # environment steps between two checkpoints
 _PACKAGES = ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy", "pybullet")
 
 
 def train(env_id: str, seed: int, folder: Path, overrides: dict[str, Any]) -> Program:
     """Return the program of one seed, trained now with the shipped settings or read from ``folder``.
 
-    Its metadata hold the settings and the seconds that the training took.
+    A training that was killed goes on from its last checkpoint, to the same program. Its metadata hold the settings and
+    the seconds of the processor that the training took.
 
     :param env_id: environment id
     :param seed: of the training
-    :param folder: where programs are kept, so that an interrupted study goes on where it was
+    :param folder: where programs and checkpoints are kept
     :param overrides: hyperparameters in place of the shipped ones
     """
     config = make_config("reptile_ppo", env_id, seed, overrides=overrides, device="cpu")
@@ -42,17 +49,48 @@ def train(env_id: str, seed: int, folder: Path, overrides: dict[str, Any]) -> Pr
     if path.exists() and (program := Program.load(path)).metadata.get("hyperparams") == settings:
         return program
     th.set_num_threads(1)
-    started = time.perf_counter()
-    model, _ = build_model(config)
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
+    run, clock = folder / f"seed_{seed}_{digest}", _Clock(folder / f"seed_{seed}_{digest}" / "processor_seconds")
+    if (run / CONFIG).exists():
+        model, _ = resume(run)
+    else:
+        run.mkdir(parents=True, exist_ok=True)
+        describe_run(run, config, {})
+        model, _ = build_model(config)
     try:
-        model.learn(config.n_timesteps)
+        train_run(model, config, run, options=TrainingOptions(save_freq=SAVE_FREQ), callbacks=[clock])
     finally:
         model.get_env().close()  # type: ignore[union-attr]
-    seconds = round(time.perf_counter() - started, 1)
-    program = model.program(hyperparams=settings, train_seconds=seconds)  # type: ignore[attr-defined]
-    folder.mkdir(parents=True, exist_ok=True)
+    program = model.program(hyperparams=settings, train_seconds=clock.seconds)  # type: ignore[attr-defined]
     program.save(path)
+    shutil.rmtree(run)
     return program
+
+
+class _Clock(BaseCallback):
+    """Counts the seconds of the processor that a training takes, those before it was interrupted, too.
+
+    :param path: where they are kept
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.path, self._started = path, time.process_time()
+        self._before = float(path.read_text()) if path.exists() else 0.0
+        self._kept = self._before
+
+    @property
+    def seconds(self) -> float:
+        """So far."""
+        return round(self._before + time.process_time() - self._started, 1)
+
+    def _on_rollout_start(self) -> None:
+        if self.seconds > self._kept + 1:
+            self._kept = self.seconds
+            write_atomically(self.path, str(self.seconds))
+
+    def _on_step(self) -> bool:
+        return True
 
 
 @cache

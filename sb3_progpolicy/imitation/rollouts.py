@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sb3_progpolicy.evaluation import spec_of
 from sb3_progpolicy.imitation.augmentation import Augment, Begin
 from sb3_progpolicy.imitation.teachers import Observations, PlannerTeacher, Situation, Teacher, join_history
-from sb3_progpolicy.programs.interpreter import ProgramRunner
+from sb3_progpolicy.programs.interpreter import ProgramRunner, Semantics
 from sb3_progpolicy.programs.syntax import ProgramData
 from sb3_progpolicy.spaces import action_spec, check_observation_space
 
@@ -196,14 +196,15 @@ def _labels(pool: Pool, teacher: Teacher | None, live: Sequence[int]) -> NDArray
 
 
 class ProgramAct:
-    """The crisp program as a function from observations to actions, which remembers.
+    """A program as a function from observations to actions, which remembers.
 
     :param program: the program
     :param n_envs: number of rows of observations
+    :param semantics: ``"crisp"`` or ``"soft"``
     """
 
-    def __init__(self, program: ProgramData, n_envs: int) -> None:
-        self._runner = ProgramRunner(program, n_envs)
+    def __init__(self, program: ProgramData, n_envs: int, semantics: Semantics = "crisp") -> None:
+        self._runner = ProgramRunner(program, n_envs, semantics)
 
     def begin(self) -> None:
         """Forget everything: other episodes are played from now on."""
@@ -214,9 +215,9 @@ class ProgramAct:
         return self._runner.act(observations)
 
 
-def program_act(program: ProgramData, n_envs: int) -> ProgramAct:
-    """Return the crisp program as a function from observations to actions."""
-    return ProgramAct(program, n_envs)
+def program_act(program: ProgramData, n_envs: int, semantics: Semantics = "crisp") -> ProgramAct:
+    """Return a program as a function from observations to actions."""
+    return ProgramAct(program, n_envs, semantics)
 
 
 @dataclass
