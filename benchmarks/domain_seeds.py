@@ -4,9 +4,10 @@
     python benchmarks/domain_seeds.py --env HikingEgo-v0 --final --ship
     python benchmarks/domain_seeds.py --env Acrobot-v1
 
-Each seed trains from scratch with ``sb3_progpolicy/hyperparams/reptile_ppo.yml``, the same for all. Its program is then
-run, crisp and soft, on every training and validation variation, on starts that training did not use. With --final it is run on the unseen variations, too, which nothing is chosen by. A finished seed is kept in
-``runs/`` and one that is interrupted goes on from its last checkpoint.
+Each seed trains from scratch with ``sb3_progpolicy/hyperparams/reptile_ppo.yml``, the same for all. Its program is
+then run, crisp and soft, on every training and validation variation, on starts that training did not use. With
+--final it is run on the unseen variations, too, which nothing is chosen by. A finished seed is kept in ``runs/`` and
+one that is interrupted goes on from its last checkpoint.
 
 Writes ``benchmarks/results/<name>.csv``, a picture of the crisp programs, and a ``.json`` with command, commit and
 versions. Says which seed is the median by what was reached in training; --ship puts it into the package.
