@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -52,6 +53,10 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
     :param symmetries: generators of the symmetries over which the program's weights are tied (see
         :class:`~sb3_progpolicy.symmetries.Group`), each a :class:`progpolicy_envs.Symmetry` or its plain data. The
         critic is not tied
+    :param persistence_init: what each action's score reads of having been taken before, at the start (for Box actions,
+        what each output reads of its previous value): exploration that keeps its way for some steps, as in Dabney et
+        al. (2021), but by the policy itself, so that PPO's ratios hold and training can undo it. The last inputs have
+        to be the interaction history
     :param net_arch: hidden layers of the critic, a list or ``dict(vf=[...])``
     :param activation_fn: of the critic
     :param log_std_init: initial logarithm of the standard deviation of Box actions
@@ -75,6 +80,7 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
         semantics: BoxSemantics = "means",
         n_conditions: int | None = None,
         symmetries: Sequence[Symmetry | Mapping[str, Any]] = (),
+        persistence_init: float = 0.0,
         net_arch: list[int] | dict[str, list[int]] | None = None,
         activation_fn: type[nn.Module] = nn.ReLU,
         log_std_init: float = 0.0,
@@ -88,6 +94,8 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
             raise ValueError(f"temperature={temperature} is not accepted; it is above 0")
         if n_conditions is not None and n_conditions < 0:
             raise ValueError(f"n_conditions={n_conditions} is not accepted; it is at least 0")
+        if not math.isfinite(persistence_init):
+            raise ValueError(f"persistence_init={persistence_init} is not accepted; it is a finite number")
         extractor = kwargs.get("features_extractor_class", FlattenExtractor)
         if extractor not in (FlattenExtractor, NormalizingExtractor):
             raise ValueError(
@@ -111,7 +119,7 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
             "semantics": semantics,
             "symmetries": symmetries,
         }
-        self.n_conditions = n_conditions
+        self.n_conditions, self.persistence_init = n_conditions, persistence_init
         if n_conditions is not None:
             self.program_kwargs["depth"] = n_conditions + 1
         self.spec_of_actions: ActionSpec = action_spec(action_space)
@@ -153,6 +161,8 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
                     layer.orthogonal_(gain)
                 else:
                     layer.apply(partial(self.init_weights, gain=gain))
+        if self.persistence_init:
+            self.module.keep_action_(self.persistence_init)
         self.optimizer = self.optimizer_class(
             [
                 {"params": self.phi(), "lr": lr_schedule(1)},
@@ -177,6 +187,7 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
             net_arch=cast(dict[str, list[int]], self.net_arch)["vf"],
             reset_state_at_episode_start=self.reset_state_at_episode_start,
             n_conditions=self.n_conditions,
+            persistence_init=self.persistence_init,
         )
         # Arguments of SB3's constructor that a program has no use for.
         for name in ("use_sde", "full_std", "use_expln"):

@@ -84,6 +84,21 @@ class ProgramModule(nn.Module):
         state_dict.setdefault(f"{prefix}action_temperature", th.ones_like(self.action_temperature))
         super()._load_from_state_dict(state_dict, prefix, *args)
 
+    @th.no_grad()
+    def keep_action_(self, weight: float) -> None:
+        """Let every controller favour the action taken before, which is among the inputs.
+
+        :param weight: is added to what each output reads of its own previous value
+        """
+        n_outputs = self.action.n_outputs
+        first = self.n_inputs - self.action.interaction_size
+        weights = self.controllers.weight.detach().clone()
+        weights.unflatten(0, (-1, n_outputs))[:, range(n_outputs), range(first, first + n_outputs)] += weight
+        if isinstance(self.controllers, TiedLinear):
+            self.controllers.set_(weights)
+        else:
+            self.controllers.weight.copy_(weights)
+
     @property
     def n_controllers(self) -> int:
         """Number of controllers in the graph."""

@@ -43,15 +43,23 @@ class TiedLinear(nn.Module):
         return rows[:, :-1], rows[:, -1]
 
     @th.no_grad()
+    def set_(self, weights: th.Tensor) -> None:
+        """Set the weights to the symmetric part of a matrix, and the biases to 0.
+
+        :param weights: ``(n_maps * n_outputs, n_inputs)``
+        """
+        n_outputs, width = self._sign.shape
+        rows = th.cat((weights.cpu(), th.zeros(len(weights), 1)), dim=1)
+        assert rows.shape == (len(self.free) * n_outputs, width)
+        signed = (rows.unflatten(0, (-1, n_outputs)) * self._sign.cpu()).flatten(1)
+        sums = th.zeros(self.free.shape).index_add_(1, self._index.cpu(), signed)
+        sizes = th.zeros(self.free.shape[1]).index_add_(0, self._index.cpu(), self._sign.cpu().abs().flatten())
+        self.free.copy_(sums / sizes.clamp_min(1))
+
     def orthogonal_(self, gain: float) -> None:
         """Set the weights to the symmetric part of an orthogonal matrix, as SB3 begins, and the biases to 0.
 
         :param gain: of the orthogonal matrix
         """
         n_outputs, width = self._sign.shape
-        weights = th.zeros(len(self.free) * n_outputs, width)
-        weights[:, :-1] = nn.init.orthogonal_(th.empty(len(weights), width - 1), gain)
-        signed = (weights.unflatten(0, (-1, n_outputs)) * self._sign.cpu()).flatten(1)
-        sums = th.zeros(self.free.shape).index_add_(1, self._index.cpu(), signed)
-        sizes = th.zeros(self.free.shape[1]).index_add_(0, self._index.cpu(), self._sign.cpu().abs().flatten())
-        self.free.copy_(sums / sizes.clamp_min(1))
+        self.set_(nn.init.orthogonal_(th.empty(len(self.free) * n_outputs, width - 1), gain))

@@ -25,7 +25,7 @@ from sb3_progpolicy.reptile.checks import check_variations
 from sb3_progpolicy.reptile.statistics import EpisodeStatistics
 from sb3_progpolicy.reptile.steps import MetaOptimizer, MetaOptimizerName, Task, begin_task
 from sb3_progpolicy.reptile.tasks import TaskDistribution, default_tasks
-from sb3_progpolicy.reptile_ppo.environments import make_venv, symmetries_of, with_history
+from sb3_progpolicy.reptile_ppo.environments import check_persistence, make_venv, symmetries_of, with_history
 from sb3_progpolicy.reptile_ppo.initial import initial_policy_kwargs, read_initial_program, start_from_program
 from sb3_progpolicy.reptile_ppo.inner_loops import (
     EngineName,
@@ -209,6 +209,7 @@ class ReptilePPO(StoredPPO):
         if normalize_observations is None:
             normalize_observations = learns_program and init_program is None
         policy_kwargs = dict(policy_kwargs or {})
+        check_persistence(policy_kwargs, interaction_history)
         self.symmetric = symmetric
         if symmetric and "symmetries" not in policy_kwargs:
             policy_kwargs["symmetries"] = symmetries_of(self.env_id, venv)
