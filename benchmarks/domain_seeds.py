@@ -141,7 +141,7 @@ def plot(name: str, rows: Sequence[Row], title: str) -> None:
             axes.plot(values, [place] * len(values), "o", color=colours[kind], alpha=0.45, markersize=5)
             if values:
                 axes.plot(np.median(values), place, "|", color=colours[kind], markersize=14)
-        axes.set(xlabel=columns[column])
+        axes.set(xlabel=columns[column], **({"xlim": (-0.03, 1.03)} if column == "success_rate" else {}))
         axes.grid(axis="x", color="#dde3ea", linewidth=0.6)
     all_axes[0][0].set_yticks(
         range(len(labels)), [f"{variation or 'as trained'}  ({kind})" for kind, variation in labels]
