@@ -29,7 +29,8 @@ from study import RESULTS, commit, train, write_results
 
 import sb3_progpolicy.pretrained
 from progpolicy_envs import find_domain
-from sb3_progpolicy.evaluation import Evaluation, evaluate_program, spec_of
+from sb3_progpolicy.env_ids import spec_of
+from sb3_progpolicy.evaluation import Evaluation, evaluate_program
 from sb3_progpolicy.imitation.rollouts import Pool, play, program_act
 from sb3_progpolicy.programs import Program
 from sb3_progpolicy.programs.files import write_atomically

@@ -30,7 +30,7 @@ from study import RESULTS, commit, write_results
 
 from progpolicy_envs import find_domain
 from sb3_progpolicy.cli.parsing import parse_variations
-from sb3_progpolicy.evaluation import spec_of
+from sb3_progpolicy.env_ids import spec_of
 from sb3_progpolicy.imitation import Imitation, imitate, make_teacher
 from sb3_progpolicy.imitation.rollouts import Episodes, Pool, play, program_act
 from sb3_progpolicy.programs import Program

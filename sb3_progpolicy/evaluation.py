@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from itertools import groupby
 from typing import Any, cast
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_wrapper
 
 from progpolicy_envs import find_domain
+from sb3_progpolicy.env_ids import id_from_file, spec_of
 from sb3_progpolicy.extraction import extract_program, holds_program, wrappers_of
 from sb3_progpolicy.interaction import VecInteractionHistory
-from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.programs.interpreter import ProgramRunner, Semantics, join_inputs
 from sb3_progpolicy.programs.syntax import ProgramData
 from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, unread_names
@@ -37,21 +33,27 @@ class Evaluation:
     :param env: environment id
     :param variation: the parameters that were set
     :param episodes: number of episodes
-    :param success_rate: share of them that reached the goal, 0 to 1
-    :param steps_mean: mean steps to the goal; an episode that fails counts as the cap, as in the paper
+    :param success_rate: share of them that reached the goal, 0 to 1; ``None`` where the environment has no goal, that
+        is, reports no ``is_success``
+    :param steps_mean: mean steps to the goal; an episode that fails counts as the cap, as in the paper. Where there is
+        no goal, the mean length of an episode
     :param steps_std: their standard deviation
     :param optimal_steps_mean: mean steps of the domain's planner on the same episodes; ``None`` where there is none
     :param semantics: ``"soft"`` or ``"crisp"``; ``None`` for a model that is not a program
+    :param return_mean: mean sum of an episode's rewards, not discounted
+    :param return_std: their standard deviation
     """
 
     env: str
     variation: Mapping[str, Any]
     episodes: int
-    success_rate: float
+    success_rate: float | None
     steps_mean: float
     steps_std: float
     optimal_steps_mean: float | None
     semantics: Semantics | None
+    return_mean: float
+    return_std: float
 
     @property
     def ratio(self) -> float | None:
@@ -256,17 +258,20 @@ def _evaluate(
         options = [{name: value for name, value in each.items() if name not in by_constructor} for each in group]
         venv = prepare(make_fast_vec_env(env_id, len(group), max_episode_steps=cap, **{**arguments, **fixed}))
         try:
-            success, steps, optimal = _play(venv, options, n_episodes, seed + first, cap, start(venv))
+            played = _play(venv, options, n_episodes, seed + first, cap, start(venv))
         finally:
             venv.close()
+        success, steps, optimal = played.success, played.steps, played.optimal
         rows += [
             Evaluation(
                 env=env_id,
                 variation=dict(variation),
                 episodes=n_episodes,
-                success_rate=float(success[row].mean()),
+                success_rate=None if np.isnan(success[row]).any() else float(success[row].mean()),
                 steps_mean=float(steps[row].mean()),
                 steps_std=float(steps[row].std()),
+                return_mean=float(played.returns[row].mean()),
+                return_std=float(played.returns[row].std()),
                 optimal_steps_mean=None if np.isnan(optimal[row]).any() else float(optimal[row].mean()),
                 semantics=semantics,
             )
@@ -289,16 +294,32 @@ def _groups(variations: Sequence[Mapping[str, Any]], batched: bool) -> Iterator[
         yield list(group)
 
 
+@dataclass(frozen=True)
+class _Played:
+    """Episodes, each array ``(n_envs, n_episodes)``.
+
+    :param success: 1 or 0; NaN where the environment reports none
+    :param steps: to the goal, or the cap; the length of the episode where there is no goal
+    :param returns: sums of rewards
+    :param optimal: the planner's steps; NaN where there is none
+    """
+
+    success: NDArray[np.float64]
+    steps: NDArray[np.float64]
+    returns: NDArray[np.float64]
+    optimal: NDArray[np.float64]
+
+
 def _play(
     venv: VecEnv, variations: Sequence[Mapping[str, Any]], n_episodes: int, seed: int, cap: int, act: Act
-) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
-    """Play ``n_episodes`` in every environment; return successes, steps, the planner's steps ``(n_envs, n_episodes)``.
+) -> _Played:
+    """Play ``n_episodes`` in every environment.
 
     An environment that has played its episodes goes on, unrecorded, until the last has.
     """
     n_envs = venv.num_envs
-    success = np.zeros((n_envs, n_episodes), dtype=bool)
-    steps = np.full((n_envs, n_episodes), float(cap))
+    success = np.full((n_envs, n_episodes), np.nan)
+    steps, returns = np.full((n_envs, n_episodes), float(cap)), np.zeros((n_envs, n_episodes))
     optimal = np.full((n_envs, n_episodes), np.nan)
     venv.seed(seed)
     given = [ReadOptions(variation) for variation in variations]
@@ -309,23 +330,41 @@ def _play(
             f"the reset option {', '.join(sorted(unread))} has no effect; the environment does not read it"
         )
     optimal[:, 0] = _optimal_steps(venv)
+    normalizer = unwrap_vec_wrapper(venv, VecNormalize)
     rewards, dones = np.zeros(n_envs, dtype=np.float32), np.zeros(n_envs, dtype=bool)
     finished, elapsed = np.zeros(n_envs, dtype=np.int64), np.zeros(n_envs, dtype=np.int64)
+    earned = np.zeros(n_envs)
     while (finished < n_episodes).any():
         observations, rewards, dones, infos = venv.step(act(observations, rewards, dones))
         elapsed += 1
+        earned += rewards if normalizer is None else normalizer.get_original_reward()
         ended = np.flatnonzero(dones & (finished < n_episodes))
         for row in ended:
-            if "is_success" not in infos[row]:
-                raise ValueError("the environment does not report is_success; use SB3's evaluate_policy for its return")
-            if infos[row]["is_success"]:
-                success[row, finished[row]], steps[row, finished[row]] = True, elapsed[row]
+            reached = infos[row].get("is_success")
+            if reached is not None:
+                success[row, finished[row]] = bool(reached)
+            if reached or reached is None:
+                steps[row, finished[row]] = elapsed[row]
+            returns[row, finished[row]] = earned[row]
         finished[ended] += 1
-        elapsed[dones] = 0
+        elapsed[dones], earned[dones] = 0, 0.0
         if going_on := [row for row in ended if finished[row] < n_episodes]:
             planned = _optimal_steps(venv)
             optimal[going_on, finished[going_on]] = planned[going_on]
-    return success, steps, optimal
+    return _Played(success, steps, returns, optimal)
+
+
+def success_and_steps(rows: Sequence[Evaluation]) -> tuple[float, float]:
+    """Return the mean success and the mean steps over several variations.
+
+    :raises ValueError: if the environment has no goal
+    """
+    rates = [row.success_rate for row in rows if row.success_rate is not None]
+    if len(rates) < len(rows):
+        raise ValueError(
+            f"{rows[0].env} is not accepted here; it does not report is_success, whether a goal is reached"
+        )
+    return float(np.mean(rates)), float(np.mean([row.steps_mean for row in rows]))
 
 
 def _optimal_steps(venv: VecEnv) -> NDArray[np.float64]:
@@ -336,32 +375,6 @@ def _optimal_steps(venv: VecEnv) -> NDArray[np.float64]:
     return np.array([info.get("optimal_steps", np.nan) for info in infos], dtype=np.float64)
 
 
-def spec_of(env_id: str) -> Any:
-    """Return the registered specification of an environment id.
-
-    :param env_id: an id, or ``module:id`` where a module registers it, which may be in the working directory
-    :raises ValueError: if there is none; the message names the nearest ids
-    """
-    module, _, name = env_id.rpartition(":")
-    if module:
-        _import(module)
-    try:
-        return gym.spec(name)
-    except gym.error.Error:
-        raise unknown("environment", env_id, gym.registry) from None
-
-
-def id_from_file(env_id: Any) -> str | None:
-    """Return an environment id that a file gives, unless a module would have to be imported for it, which runs code.
-
-    :param env_id: from the metadata of a program
-    """
-    if not isinstance(env_id, str):
-        return None
-    module = env_id.rpartition(":")[0]
-    return env_id if not module or module in sys.modules else None
-
-
 def _as_json(value: Any) -> Any:
     """Return NumPy's numbers and arrays as Python's, in mappings and sequences too."""
     if isinstance(value, Mapping):
@@ -369,14 +382,3 @@ def _as_json(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_as_json(item) for item in value]
     return value.tolist() if isinstance(value, (np.generic, np.ndarray)) else value
-
-
-def _import(module: str) -> None:
-    here = os.getcwd()
-    sys.path.append(here)
-    try:
-        import_module(module)
-    except Exception as error:  # a module may raise anything
-        raise ValueError(f"module {module!r} cannot be imported: {type(error).__name__}: {error}") from None
-    finally:
-        sys.path.remove(here)

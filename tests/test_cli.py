@@ -23,6 +23,8 @@ FIELDS = {
     "success_rate",
     "steps_mean",
     "steps_std",
+    "return_mean",
+    "return_std",
     "optimal_steps_mean",
     "semantics",
     "learned_by",

@@ -4,6 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_progpolicy import ReptilePPO, evaluate_model, evaluate_program, load_pretrained
 from sb3_progpolicy.cli import run
@@ -86,10 +88,23 @@ def test_wrong_argument_is_named(arguments, said):
         evaluate_program(hanoi_program(), **{"env_id": "Hanoi-v0", **arguments})
 
 
-def test_environment_without_a_goal_is_refused():
+@pytest.mark.parametrize("normalized", [False, True])
+def test_environment_without_a_goal_has_returns_and_lengths(normalized):
     assert "is_success" not in gym.make("CartPole-v1").reset()[1]
-    with pytest.raises(ValueError, match="is_success"):
-        evaluate_model(PPO("MlpPolicy", "CartPole-v1", n_steps=8, batch_size=8), "CartPole-v1")
+    env = make_vec_env("CartPole-v1", 2)
+    model = PPO("MlpPolicy", VecNormalize(env) if normalized else env, n_steps=8, batch_size=8, seed=0).learn(64)
+    (row,) = evaluate_model(model, "CartPole-v1", n_episodes=5)
+    assert row.success_rate is None
+    assert row.steps_mean == row.return_mean > 5  # a reward of 1 in each step
+    assert row.steps_std == row.return_std
+
+
+def test_returns_are_sums_of_rewards():
+    (row,) = evaluate_program(hanoi_program(), "Hanoi-v0", [{"n_discs": 3}])
+    env = gym.make("Hanoi-v0", n_discs=3)
+    env.reset()
+    rewards = [env.step(action)[1] for action in env.unwrapped.plan()]
+    assert row.return_mean == pytest.approx(sum(rewards), abs=1e-5)
 
 
 def test_program_file_imports_no_module(tmp_path, monkeypatch, capsys):

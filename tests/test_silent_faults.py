@@ -263,7 +263,7 @@ def test_statistics_of_the_critic_move_too_where_it_has_its_own():
 
 def test_evaluation_of_numpy_values_is_json():
     row = Evaluation(
-        "X-v0", {"wind": np.array([1.0, 2.0]), "n": np.int64(3)}, 1, np.float64(1.0), 2.0, 0.0, None, "soft"
+        "X-v0", {"wind": np.array([1.0, 2.0]), "n": np.int64(3)}, 1, np.float64(1.0), 2.0, 0.0, None, "soft", 0.0, 0.0
     )
     assert json.loads(json.dumps(row.to_json()))["variation"] == {"wind": [1.0, 2.0], "n": 3}
 

@@ -19,7 +19,7 @@ SEARCH = {
 
 
 def row(n_discs, steps):
-    return Evaluation("Hanoi-v0", {"n_discs": n_discs}, 1, 1.0, steps, 0.0, 31.0, None)
+    return Evaluation("Hanoi-v0", {"n_discs": n_discs}, 1, 1.0, steps, 0.0, 31.0, None, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("algo", METHODS)

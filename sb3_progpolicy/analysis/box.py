@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sb3_progpolicy.analysis.finetune import finetune, matrix_of, why_not, with_controllers
 from sb3_progpolicy.analysis.terms import Floats, Term, terms_of
-from sb3_progpolicy.evaluation import Evaluation, evaluate_program
+from sb3_progpolicy.evaluation import Evaluation, evaluate_program, success_and_steps
 from sb3_progpolicy.programs.syntax import Controller, Expression, IfThenElse, ProgramData
 
 MAX_TERMS = 40
@@ -302,11 +302,11 @@ def prune(
     :raises ValueError: if no program of so many terms was found
     """
     states, rows = visited(program, env_id, variations, episodes, seed)
-    success, steps = _means(rows)
+    success, steps = success_and_steps(rows)
     cap = max(1, math.ceil(PATIENCE * max(row.steps_mean for row in rows)))  # bad programs are not waited for
 
     def measure(candidate: ProgramData) -> tuple[float, float]:
-        return _means(evaluate_program(candidate, env_id, variations, episodes, seed=seed, max_steps=cap))
+        return success_and_steps(evaluate_program(candidate, env_id, variations, episodes, seed=seed, max_steps=cap))
 
     def good_enough(success_rate: float, steps_mean: float) -> bool:
         return success_rate >= success - success_tolerance and steps_mean <= steps * (1 + steps_tolerance)
@@ -366,7 +366,3 @@ def _finetuned(
             return dataclasses.replace(pruned, point=point, finetuned=n_timesteps, learned_by=learned_by)
     note = f"{n_timesteps} steps of training made it no better ({success:.0%}, {steps:g} steps)"
     return dataclasses.replace(pruned, notes=(*pruned.notes, note))
-
-
-def _means(rows: Sequence[Evaluation]) -> tuple[float, float]:
-    return float(np.mean([row.success_rate for row in rows])), float(np.mean([row.steps_mean for row in rows]))

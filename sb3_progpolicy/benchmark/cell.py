@@ -159,7 +159,8 @@ def _evaluate(cell: Cell, model: BaseAlgorithm) -> list[dict[str, Any]]:
         )
         for result in results:
             row = result.to_json()
-            del row["env"]
+            for column in ("env", "return_mean", "return_std"):
+                del row[column]
             rows.append({"set": name, "relation": domain.relation(dict(result.variation), trained_on), **row})
     return rows
 

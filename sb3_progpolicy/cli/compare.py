@@ -73,7 +73,8 @@ def _print_table(compared: Any, learned: Sequence[str | None]) -> None:
     from rich.table import Table
 
     first = compared[0].rows
-    table = Table(title=f"{first[0].env}, {first[0].episodes} episode(s) each, [share solved]")
+    shown = "returns" if first[0].success_rate is None else "[share solved]"
+    table = Table(title=f"{first[0].env}, {first[0].episodes} episode(s) each, {shown}")
     names = list(first[0].variation)
     for name in names:
         table.add_column(name)
@@ -84,6 +85,9 @@ def _print_table(compared: Any, learned: Sequence[str | None]) -> None:
         cells = []
         for run in compared:
             own = run.rows[number]
+            if own.success_rate is None:
+                cells.append(f"{own.return_mean:.1f} ± {own.return_std:.1f}")
+                continue
             solved = "" if own.success_rate == 1 else f" [{own.success_rate:.0%}]"
             cells.append(f"{own.steps_mean:.1f}{solved}")
         optimum = "-" if row.optimal_steps_mean is None else f"{row.optimal_steps_mean:.1f}"

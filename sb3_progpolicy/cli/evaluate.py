@@ -37,6 +37,7 @@ def evaluate(
     """Measure success and steps on variations, next to the steps of the domain's planner.
 
     An episode that fails counts as the cap, 500 steps. Without --set: the domain's training sizes and all larger ones.
+    Where the environment reports no success: returns and lengths of episodes.
     """
     if semantics not in (*SEMANTICS, "both"):
         raise unknown("semantics", semantics, (*SEMANTICS, "both"))
@@ -78,20 +79,28 @@ def _print_table(rows: list[Evaluation], caption: str | None) -> None:
     names = list(dict.fromkeys(name for row in rows for name in row.variation))
     for name in [*names, "semantics"]:
         table.add_column(name)
-    for name in ("success", "steps", "optimum", "ratio"):
+    goal = any(row.success_rate is not None for row in rows)
+    for name in ("success", "steps", "optimum", "ratio") if goal else ("return", "steps"):
         table.add_column(name, justify="right")
     previous = rows[0].semantics
     for row in rows:
         if row.semantics != previous:
             table.add_section()
             previous = row.semantics
-        deviation = f" ± {row.steps_std:.1f}" if row.steps_std else ""
+        about = (*(str(row.variation.get(name, "")) for name in names), row.semantics or "-")
+        steps = _with_deviation(row.steps_mean, row.steps_std)
+        if not goal:
+            table.add_row(*about, _with_deviation(row.return_mean, row.return_std), steps)
+            continue
         table.add_row(
-            *(str(row.variation.get(name, "")) for name in names),
-            row.semantics or "-",
-            f"{row.success_rate:.0%}",
-            f"{row.steps_mean:g}{deviation}",
+            *about,
+            "-" if row.success_rate is None else f"{row.success_rate:.0%}",
+            steps,
             "-" if row.optimal_steps_mean is None else f"{row.optimal_steps_mean:g}",
             "-" if row.ratio is None else f"{row.ratio:.2f}",
         )
     Console().print(table)
+
+
+def _with_deviation(mean: float, deviation: float) -> str:
+    return f"{mean:g} ± {deviation:.1f}" if deviation else f"{mean:g}"

@@ -43,7 +43,7 @@ def _planned(env_id: str, options: dict[str, Any], seed: int) -> tuple[str, Sequ
     """Let the planner act for an episode; return the id, the names of actions, the actions and whether they succeed."""
     import gymnasium as gym
 
-    from sb3_progpolicy.evaluation import spec_of
+    from sb3_progpolicy.env_ids import spec_of
 
     game = gym.make(spec_of(env_id).id)
     try:

@@ -24,7 +24,7 @@ def play(
     """Step a planning domain yourself: one key for each action, q to stop."""
     import gymnasium as gym
 
-    from sb3_progpolicy.evaluation import spec_of
+    from sb3_progpolicy.env_ids import spec_of
 
     variations = parse_variations(variation or [])
     if len(variations) != 1:

@@ -130,7 +130,7 @@ def _simplified(program: Program, env_id: str | None) -> Program:
 
 def _text(program: Program, full: bool) -> str:
     """The program, all of it where it is small or asked for, and what its inputs are."""
-    from sb3_progpolicy.evaluation import id_from_file
+    from sb3_progpolicy.env_ids import id_from_file
     from sb3_progpolicy.programs import export_text
 
     whole = full or "simplified" in program.metadata

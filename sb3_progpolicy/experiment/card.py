@@ -103,8 +103,8 @@ def _table(source: Source, rows: Sequence[Evaluation], n_episodes: int) -> list[
         f"{n_episodes} episodes on each variation; one that fails counts as the cap on steps. "
         + ("The program is run crisp, as it is read." if source.program is not None else "Most likely actions."),
         "",
-        "| variation | training | success | steps | planner | ratio |",
-        "|---|---|---:|---:|---:|---:|",
+        "| variation | training | success | steps | planner | ratio | return |",
+        "|---|---|---:|---:|---:|---:|---:|",
     ]
     for row in rows:
         relation = "" if domain is None or domain.size not in row.variation else domain.relation(dict(row.variation))
@@ -112,5 +112,7 @@ def _table(source: Source, rows: Sequence[Evaluation], n_episodes: int) -> list[
         optimum = "-" if row.optimal_steps_mean is None else f"{row.optimal_steps_mean:.1f}"
         ratio = "-" if row.ratio is None else f"{row.ratio:.2f}"
         steps = f"{row.steps_mean:.1f} ± {row.steps_std:.1f}"
-        lines.append(f"| {name} | {relation} | {row.success_rate:.0%} | {steps} | {optimum} | {ratio} |")
+        success = "-" if row.success_rate is None else f"{row.success_rate:.0%}"
+        reward = f"{row.return_mean:.1f} ± {row.return_std:.1f}"
+        lines.append(f"| {name} | {relation} | {success} | {steps} | {optimum} | {ratio} | {reward} |")
     return [*lines, ""]

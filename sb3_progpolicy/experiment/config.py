@@ -12,7 +12,7 @@ import torch as th
 from gymnasium.envs.registration import load_env_creator
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_progpolicy.evaluation import spec_of
+from sb3_progpolicy.env_ids import spec_of
 from sb3_progpolicy.experiment.methods import METHODS, get_method
 from sb3_progpolicy.hyperparams import load_hyperparams, parse_kwargs, parse_number, shortened
 from sb3_progpolicy.nearest import unknown

@@ -41,7 +41,7 @@ def record(
     """
     import gymnasium as gym
 
-    from sb3_progpolicy.evaluation import spec_of
+    from sb3_progpolicy.env_ids import spec_of
 
     if output.suffix.lower() not in FORMATS:
         raise ValueError(f"-o {str(output)!r} is not accepted; the file is a .gif or an .mp4")
@@ -72,7 +72,7 @@ def environment_of(name: str) -> Source:
     """
     import gymnasium as gym
 
-    from sb3_progpolicy.evaluation import spec_of
+    from sb3_progpolicy.env_ids import spec_of
 
     if name in gym.registry or not Path(name).exists():
         return Source(name, spec_of(name).id, None, None, {})

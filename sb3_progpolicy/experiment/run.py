@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from progpolicy_envs import find_domain
-from sb3_progpolicy.evaluation import evaluate_any
+from sb3_progpolicy.evaluation import evaluate_any, success_and_steps
 from sb3_progpolicy.experiment.config import REPTILE, RunConfig, check_surroundings, parse_schedule
 from sb3_progpolicy.experiment.folder import (
     EVALUATIONS,
@@ -313,8 +313,11 @@ class _EvaluateVariations(BaseCallback):
         )
         self._kept += [{"timesteps": self.num_timesteps, **row.to_json()} for row in rows]
         write_atomically(self.path, json.dumps(self._kept, indent=1) + "\n")
-        self.logger.record("eval/success_rate", sum(row.success_rate for row in rows) / len(rows))
-        self.logger.record("eval/steps_mean", sum(row.steps_mean for row in rows) / len(rows))
+        if all(row.success_rate is not None for row in rows):
+            success, steps = success_and_steps(rows)
+            self.logger.record("eval/success_rate", success)
+            self.logger.record("eval/steps_mean", steps)
+        self.logger.record("eval/return_mean", sum(row.return_mean for row in rows) / len(rows))
 
     def _on_step(self) -> bool:
         return True

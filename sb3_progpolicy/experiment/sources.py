@@ -64,7 +64,7 @@ def find_source(name: str, allow_pickle: bool = False) -> Source:
     if path.is_dir():
         return _from_run(path, allow_pickle)
     if path.is_file() and path.suffix == ".json":
-        from sb3_progpolicy.evaluation import id_from_file
+        from sb3_progpolicy.env_ids import id_from_file
 
         source = _from_program(name, load_program(path))
         return replace(source, env_id=id_from_file(source.env_id))

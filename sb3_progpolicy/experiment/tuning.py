@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from progpolicy_envs import Domain, get_domain
-from sb3_progpolicy.evaluation import Evaluation, evaluate_any, spec_of
+from sb3_progpolicy.env_ids import spec_of
+from sb3_progpolicy.evaluation import Evaluation, evaluate_any
 from sb3_progpolicy.experiment.budget import ProcessorTimeLimit
 from sb3_progpolicy.experiment.config import RunConfig, make_config
 from sb3_progpolicy.experiment.run import build_model

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_progpolicy.evaluation import spec_of
+from sb3_progpolicy.env_ids import spec_of
 from sb3_progpolicy.imitation.augmentation import Augment, Begin
 from sb3_progpolicy.imitation.teachers import Observations, PlannerTeacher, Situation, Teacher, join_history
 from sb3_progpolicy.programs.interpreter import ProgramRunner, Semantics
