@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from progpolicy_envs.panda.camera import Camera
 from progpolicy_envs.panda.focus import ACTION_NAMES, BOUND, OBSERVATION_NAMES, focus_observation
 from progpolicy_envs.panda.physics import CONTROL_STEP, ObjectState, Physics
+from progpolicy_envs.panda.placement import Points
 from progpolicy_envs.panda.scene import Scene
 from progpolicy_envs.panda.tasks import Task
 from progpolicy_envs.rendering import Frame
 from progpolicy_envs.single import DomainEnv, require_reset
 from progpolicy_envs.symmetry import Permutation, Symmetry
-from progpolicy_envs.variation import Variation, VariationSpace
+from progpolicy_envs.variation import Variation, VariationSpace, draw_n_done
 
 FlatObservation = NDArray[np.float32]
 Observation = FlatObservation | dict[str, NDArray[np.float32]]
@@ -59,7 +60,8 @@ def check_choice(name: str, value: Any, choices: Sequence[Any]) -> None:
 class PandaEnv(DomainEnv):
     """What the Panda environments have in common; see :class:`~progpolicy_envs.panda.PandaPushEnv` and the others.
 
-    A subclass names its :attr:`task_class`, its one variation parameter and its :attr:`controller`.
+    A subclass names its :attr:`task_class`, its variation parameters, the number of objects first, and its
+    :attr:`controller`.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": round(1 / CONTROL_STEP)}
@@ -157,7 +159,7 @@ class PandaEnv(DomainEnv):
         require_reset(self._started, "start")
         start = {"starts": self.task.starts, "targets": self.task.targets}
         places = {name: [list(place) for place in start[name]] for name in self.variations.starts}
-        return {next(iter(self.variations)): len(self.task.targets), **places}
+        return {self._size: len(self.task.targets), "n_done": self.task.n_done, **places}
 
     def replace_start(self, start: Mapping[str, Any]) -> Observation:
         """Begin the episode once more with other starts or targets.
@@ -168,9 +170,8 @@ class PandaEnv(DomainEnv):
         """
         task = self.task
         given = {"starts": task.starts, "targets": task.targets, **start}
-        task.place(self.scene, *task.read_start(len(task.targets), given["starts"], given["targets"]))
-        self._update_focus()
-        return self._observation()
+        read = task.read_start(len(task.targets), given["starts"], given["targets"], task.n_done)
+        return self._place(*read, task.n_done)
 
     def render(self) -> Any:
         """Return a picture ``(360, 480, 3)`` of bytes, or show a window, as ``render_mode`` says."""
@@ -190,11 +191,21 @@ class PandaEnv(DomainEnv):
             yield type(self).controller(self._flat_observation())
 
     def _start(self, variation: Variation, start: Mapping[str, Any]) -> None:
-        (size,) = variation.values()
-        self.task.place(self.scene, *self.task.sample(self.np_random, size))
-        self._update_focus()
+        starts, targets = self.task.sample(self.np_random, variation[self._size])
+        self._place(starts, targets, draw_n_done(variation, self._size, self.np_random))
         if start:
             self.replace_start(start)
+
+    def _place(self, starts: Points, targets: Points, n_done: int, neutral: bool = False) -> Observation:
+        """Begin an episode; see :meth:`Task.place`. Return its observation."""
+        self.task.place(self.scene, starts, targets, n_done, neutral)
+        self._update_focus()
+        return self._observation()
+
+    @property
+    def _size(self) -> str:
+        """Name of the parameter that says how many objects there are."""
+        return next(iter(self.variations))
 
     def _reward(self, observation: Any, info: Mapping[str, Any]) -> float:
         """Return the reward of the present step."""

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 from progpolicy_envs.panda.libraries import pybullet
+from progpolicy_envs.panda.physics import Hand
 
 BASE_POSITION = (-0.6, 0.0, 0.0)
 #: Largest displacement of the gripper that one action asks for, metres.
@@ -134,11 +135,15 @@ class PandaRobot:
         )
         pybullet.changeConstraint(gear, gearRatio=-1, erp=0.1, maxForce=100, physicsClientId=self.client)
 
-    def place(self) -> None:
-        """Put all joints into the neutral pose, at rest, fingers closed."""
-        for joint, angle in zip(_JOINTS, _NEUTRAL, strict=True):
+    def place(self, hand: Hand | None = None) -> None:
+        """Put all joints into a pose, at rest.
+
+        :param hand: where the gripper is; by default the pose is the neutral one, fingers closed
+        """
+        pose = _NEUTRAL if hand is None else (*arm_angles(*hand.position), hand.width / 2, hand.width / 2)
+        for joint, angle in zip(_JOINTS, pose, strict=True):
             pybullet.resetJointState(self.body, joint, angle, 0.0, physicsClientId=self.client)
-        self._drive(_NEUTRAL)
+        self._drive(pose)
 
     def read(self) -> None:
         """Read the gripper's position, velocity and width from the simulation, in two calls of PyBullet."""

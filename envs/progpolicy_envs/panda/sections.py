@@ -48,7 +48,8 @@ SECTIONS = {
         """,
     "start": """
         ``env.reset(options={"n_objects": 1, "starts": [[-0.1, 0.1]], "targets": [[0.0, -0.1]]})`` gives them instead,
-        as x and y in metres; whether the task can then be solved is not checked. ``env.unwrapped.start`` is what the
+        as x and y in metres; whether the task can then be solved is not checked. Starts
+        of what ``n_done`` has finished are not used. ``env.unwrapped.start`` is what the
         present episode started with, in this form.
         """,
     "rules": """
@@ -65,6 +66,8 @@ SECTIONS = {
         | Parameter   | Values              | Default   | Meaning                                                   |
         |-------------|---------------------|-----------|-----------------------------------------------------------|
         | $size   | 1 to 8              | 1         | number of $things                                         |
+        | n_done      | 0 to 7, "random"    | 0         | $things finished at the start, fewer than there are;      |
+        |             |                     |           | "random" draws a number for every episode                 |
         | observation | "flat", "goal"      | "flat"    | one array, or the dictionary of a goal environment        |
         | reward_type | "dense", "sparse"   | "dense"   | see above                                                 |
         | physics     | ``Physics``, None   | None      | time step and solver; None is 120 Hz, 4 steps an action   |
