@@ -85,6 +85,11 @@ class PandaReachEnv(PandaEnv):
     * 10 per metre by which the object in focus came closer to its target,
     $rewards
 
+    ``reward_type="potential"``: $gains
+
+    * -10 per metre of the gripper's way through the targets that are left, in order,
+    * 1 for every target that has been visited.
+
     ``reward_type="sparse"``: 0 where the object in focus is at its target, -1 otherwise.
 
     ## Starting State
@@ -149,6 +154,18 @@ class PandaPushEnv(_ObjectsEnv):
     * 5 per metre by which the gripper came closer to the point 5 cm behind the object, seen from its target,
     $rewards
 
+    ``reward_type="potential"``: $gains
+
+    $left
+    * -5 per metre of the gripper's way to where it pushes the block in focus from: 3 to 5 cm behind its centre, seen
+      from the target, at its height. The way is the horizontal distance from there, plus half of the height above the
+      centre, plus 1.5 times the height that the gripper lacks: it should be 0.8 times as high above the centre as it is
+      away, up to 8 cm, and 5 cm over the block itself. So the way leads through the air, down behind the block, and
+      no place on top of the block or around it is at rest,
+    $leaving
+
+    $reach
+
     ``reward_type="sparse"``: 0 where the object in focus is at its target, -1 otherwise.
 
     ## Starting State
@@ -160,8 +177,8 @@ class PandaPushEnv(_ObjectsEnv):
     $start
 
     ## Episode End
-    Terminated when every object is finished, or as a failure when one leaves the table; truncated after 500 steps
-    (``max_episode_steps``).
+    Terminated when every object is finished, or as a failure when one leaves the table or, with
+    ``reward_type="potential"``, is out of reach; truncated after 500 steps (``max_episode_steps``).
 
     $rules
     """
@@ -200,6 +217,18 @@ class PandaSlideEnv(_ObjectsEnv):
     * 5 per metre by which the gripper came closer to the point 6 cm behind the object, seen from its target,
     $rewards
 
+    ``reward_type="potential"``: $gains
+
+    $left
+    * -5 per metre of the gripper's way to where it pushes the puck in focus from: 4 to 6 cm behind its centre, seen
+      from the target, at its height. The way is the horizontal distance from there, plus half of the height above the
+      centre, plus 1.5 times the height that the gripper lacks: it should be 0.8 times as high above the centre as it is
+      away, up to 8 cm, and 5 cm over the puck itself; 0.6 m more for every other puck that is left,
+    * 1 for every delivered puck.
+
+    With it, a puck that lies still beyond 80 cm from the axis on which the arm turns, not delivered, ends the episode
+    as a failure; most targets are beyond.
+
     ``reward_type="sparse"``: 0 where the object in focus is at its target, -1 otherwise.
 
     ## Starting State
@@ -211,8 +240,8 @@ class PandaSlideEnv(_ObjectsEnv):
     $start
 
     ## Episode End
-    Terminated when every object is finished, or as a failure when one leaves the table; truncated after 500 steps
-    (``max_episode_steps``).
+    Terminated when every object is finished, or as a failure when one leaves the table or, with
+    ``reward_type="potential"``, is out of reach; truncated after 500 steps (``max_episode_steps``).
 
     $rules
     """
@@ -250,6 +279,16 @@ class PandaStackEnv(_ObjectsEnv):
     * 5 per metre by which the gripper came closer to the object,
     $rewards
 
+    ``reward_type="potential"``: $gains
+
+    $left
+    * -5 per metre of the gripper's way to the block in focus: the horizontal distance, plus half of the height above
+      it, plus 1.5 times the height that the gripper lacks, which should be twice as high above the block as it is away,
+      up to 8 cm; and while it is above the block, what the fingers lack to be open, 8 cm,
+    $leaving
+
+    $reach
+
     ``reward_type="sparse"``: 0 where the object in focus is at its target, at rest and free of the gripper,
     -1 otherwise.
 
@@ -261,8 +300,8 @@ class PandaStackEnv(_ObjectsEnv):
     $start In a tower all targets have the same x and y.
 
     ## Episode End
-    Terminated when every object is finished, or as a failure when one leaves the table; truncated after 500 steps
-    (``max_episode_steps``).
+    Terminated when every object is finished, or as a failure when one leaves the table or, with
+    ``reward_type="potential"``, is out of reach; truncated after 500 steps (``max_episode_steps``).
 
     $rules
     """

@@ -41,6 +41,8 @@ MIRROR = Symmetry(
     Permutation.flips(ACTION_NAMES, ("move_y",)),
 )
 
+REWARD_TYPES = ("dense", "potential", "sparse")
+
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 _STILL = (0.0, 0.0, 0.0)
 
@@ -82,7 +84,7 @@ class PandaEnv(DomainEnv):
         physics: Physics | None = None,
         context: str = "hidden",
     ) -> None:
-        check_choice("reward_type", reward_type, ("dense", "sparse"))
+        check_choice("reward_type", reward_type, REWARD_TYPES)
         check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         super().__init__(variation, self._observed_space(), render_mode, context)
         self.reward_type = reward_type
@@ -90,7 +92,7 @@ class PandaEnv(DomainEnv):
         self.task = self.task_class()
         self.scene = Scene(self.task.table, self.task.kind, physics, visual=render_mode is not None)
         self._camera = Camera(self.scene, self.task) if render_mode is not None else None
-        self._approach_distance = 0.0
+        self._approach_distance = self._potential = 0.0
 
     def _observed_space(self) -> spaces.Space[Any]:
         """Return the space of observations, without the variation's numbers."""
@@ -119,20 +121,14 @@ class PandaEnv(DomainEnv):
 
         :return: observation, reward, info
         """
-        task, index, achieved, n_left = self.task, self._focus, self._achieved, self._n_left
-        before = self._approach_distance
+        task, index, achieved = self.task, self._focus, self._achieved
         self.scene.sync_state()
         task.update(self.scene)
-        failure = task.failed
-        self._approach_distance = self._distance_to_approach_point(index)
-        shaping = STEP + APPROACH * (before - self._approach_distance) + FAILURE * failure
-        self._update_focus(index)
-        shaping += FINISHED * (n_left - self._n_left)
+        by_potential = self.reward_type == "potential"
+        failure = task.failed or (by_potential and task.out_of_reach)
+        shaping = self._potential_shaping(failure) if by_potential else self._dense_shaping(failure)
         if self._focus != index:
-            # The new object has made no progress yet; that of the old one goes into the shaping.
-            target = task.targets[index]
-            shaping += PROGRESS * (math.dist(achieved, target) - math.dist(task.positions[index], target))
-            achieved = self._achieved
+            achieved = self._achieved  # the new object has made no progress yet
         info = {
             "is_success": self._n_left == 0,
             "is_failure": failure,
@@ -142,6 +138,33 @@ class PandaEnv(DomainEnv):
         }
         observation = self._observation()
         return observation, self._reward(observation, info), info
+
+    def _dense_shaping(self, failure: bool) -> float:
+        """Return what the dense reward has besides the progress of the object in focus, and find the new focus."""
+        index, achieved, n_left, before = self._focus, self._achieved, self._n_left, self._approach_distance
+        self._approach_distance = self._distance_to_approach_point(index)
+        shaping = STEP + APPROACH * (before - self._approach_distance) + FAILURE * failure
+        self._update_focus(index)
+        shaping += FINISHED * (n_left - self._n_left)
+        if self._focus != index:
+            # That of the old one, which is not in focus any more.
+            target = self.task.targets[index]
+            shaping += PROGRESS * (math.dist(achieved, target) - math.dist(self.task.positions[index], target))
+        return shaping
+
+    def _potential_shaping(self, failure: bool) -> float:
+        """Return the reward by potential less the progress of the object in focus, and find the new focus."""
+        index, achieved, before = self._focus, self._achieved, self._potential
+        self._update_focus(index)
+        shaping = STEP + self._potential - before + FAILURE * failure
+        if self._focus == index:
+            shaping -= PROGRESS * (math.dist(achieved, self._desired) - math.dist(self._achieved, self._desired))
+        return shaping
+
+    def potential(self) -> float:
+        """Return the potential of the present state, whose gains are the reward of ``reward_type="potential"``."""
+        require_reset(self._started, "potential()")
+        return self._find_potential()
 
     def plan(self) -> Iterator[Action]:
         """Return an iterator of the scripted controller's actions, each for the state in which the environment then is.
@@ -225,6 +248,13 @@ class PandaEnv(DomainEnv):
         self._desired = self.task.targets[self._focus]
         if self._focus != before:
             self._approach_distance = self._distance_to_approach_point(self._focus)
+        if self.reward_type == "potential":
+            self._potential = self._find_potential()
+
+    def _find_potential(self) -> float:
+        task = self.task
+        left = PROGRESS * task.distance_left() + APPROACH * task.way_left(self.scene)
+        return FINISHED * task.finished.count(True) - left
 
     def _distance_to_approach_point(self, index: int) -> float:
         point = self.task.approach_point(index)

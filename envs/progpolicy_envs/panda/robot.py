@@ -34,8 +34,10 @@ _SHOULDER, _UPPER_ARM, _FOREARM, _ELBOW, _WRIST, _HAND = 0.333, 0.316, 0.384, 0.
 _TO_ELBOW, _TO_WRIST = math.hypot(_UPPER_ARM, _ELBOW), math.hypot(_FOREARM, _ELBOW)
 _ELBOW_ANGLES = math.atan2(_ELBOW, _UPPER_ARM), math.atan2(_ELBOW, _FOREARM)
 _BENT = sum(_ELBOW_ANGLES)
-# The gripper stays this far from the axis on which the arm turns: nearer, a small displacement is a large turn.
-_NEAREST = 0.2
+#: The gripper stays this far from the axis on which the arm turns: nearer, a small displacement is a large turn.
+NEAREST = 0.2
+#: On the table the gripper comes this far from that axis.
+FARTHEST = 0.8
 
 
 def motor_gain(time_step: float) -> float:
@@ -63,7 +65,7 @@ def arm_angles(x: float, y: float, z: float) -> list[float]:
     """
     x, y = x - BASE_POSITION[0], y - BASE_POSITION[1]
     turn = math.atan2(y, x)
-    out, up = max(_NEAREST, math.hypot(x, y)) - _WRIST, z + _HAND - _SHOULDER
+    out, up = max(NEAREST, math.hypot(x, y)) - _WRIST, z + _HAND - _SHOULDER
     span = math.hypot(out, up)
     at_elbow = _corner(_TO_ELBOW, _TO_WRIST, span)
     at_shoulder = _corner(_TO_ELBOW, span, _TO_WRIST)

@@ -10,7 +10,8 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from progpolicy_envs.panda.physics import Hand, ObjectKind, Point, Table
-from progpolicy_envs.panda.placement import Points, check_apart, check_on_table, read_points
+from progpolicy_envs.panda.placement import Points, check_apart, check_on_table, in_reach, read_points
+from progpolicy_envs.panda.potential import FULL_WAY, way_after
 from progpolicy_envs.panda.scene import FALL_DEPTH, Scene
 
 
@@ -125,6 +126,30 @@ class Task(ABC):
                 return True
         return False
 
+    @property
+    def out_of_reach(self) -> bool:
+        """Whether an unfinished object is where the arm cannot work at it, so that the task cannot be done any more."""
+        return any(
+            not finished and not in_reach(position)
+            for finished, position in zip(self.finished, self.positions, strict=True)
+        )
+
+    def distance_left(self) -> float:
+        """Return how far all objects are from their targets in all, finished ones too, metres."""
+        return sum(map(math.dist, self.positions, self.targets))
+
+    def way_left(self, scene: Scene) -> float:
+        """Return the length of the gripper's ways to the objects that are unfinished, metres, 0 when there are none.
+
+        The first of them is that to the object in focus, in which leaving a finished object comes first; each of the
+        others counts :data:`~progpolicy_envs.panda.potential.FULL_WAY`.
+        """
+        if False not in self.finished:
+            return 0.0
+        finished = [place for place, done in zip(self.positions, self.finished, strict=True) if done]
+        way = way_after(self.approach(scene, self.focus), scene.robot.position, finished)
+        return way + FULL_WAY * (self.finished.count(False) - 1)
+
     def settled(self, scene: Scene, index: int) -> bool:
         """Return whether an object would be finished if it were at its target: whether all other conditions hold."""
         return True
@@ -132,6 +157,10 @@ class Task(ABC):
     @abstractmethod
     def sample(self, rng: np.random.Generator, n_objects: int) -> tuple[Points, Points]:
         """Return starts (``(n, 3)``; ``(0, 3)`` for Reach) and targets ``(n, 3)``."""
+
+    @abstractmethod
+    def approach(self, scene: Scene, index: int) -> float:
+        """Return the length of the gripper's way to where it moves an object from, metres."""
 
     @abstractmethod
     def approach_point(self, index: int) -> Point | None:

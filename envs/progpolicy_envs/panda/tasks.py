@@ -20,18 +20,22 @@ from progpolicy_envs.panda.placement import (
     corridor_distance,
     corridor_distances,
     extended,
+    in_reach,
     reachable,
     read_points,
     sample_in_order,
 )
+from progpolicy_envs.panda.potential import way_behind, way_onto
 from progpolicy_envs.panda.robot import BASE_POSITION, MAX_WIDTH
 from progpolicy_envs.panda.scene import Scene
 from progpolicy_envs.panda.task import DISC, Mark, Task
 
-#: How far behind a block and a puck the gripper has to be to push it, metres.
-BEHIND_BLOCK, BEHIND_PUCK = 0.05, 0.06
+#: How far behind a block and a puck the gripper has to be to push it, metres, and how much nearer it is in contact.
+BEHIND_BLOCK, BEHIND_PUCK, GAP = 0.05, 0.06, 0.02
 #: How high above a block that has been stacked the gripper rises, metres.
 RISEN = 0.06
+#: An object that moves less than this in one control step is at rest, metres.
+REST_MOTION = 0.001
 
 
 class Reach(Task):
@@ -60,6 +64,26 @@ class Reach(Task):
     def hand_after(self, index: int) -> Hand:
         """Return the target itself."""
         return Hand(self.targets[index])
+
+    @property
+    def out_of_reach(self) -> bool:
+        """``False``: there are no objects."""
+        return False
+
+    def distance_left(self) -> float:
+        """Return the length of the gripper's way through the targets that are left, metres."""
+        if False not in self.finished:
+            return 0.0
+        left = [self.positions[0], *self.targets[self.focus :]]
+        return sum(map(math.dist, left, left[1:]))
+
+    def way_left(self, scene: Scene) -> float:
+        """Return 0: the gripper itself is what moves."""
+        return 0.0
+
+    def approach(self, scene: Scene, index: int) -> float:
+        """Return 0: the gripper itself is what moves."""
+        return 0.0
 
     def read_start(self, n_objects: int, starts: Any, targets: Any, n_done: int = 0) -> tuple[Points, Points]:
         """Return no starts, and targets that a user gives.
@@ -153,6 +177,11 @@ class Push(Task):
         """Return the point behind the block on the line to its target."""
         return _behind(self.positions[index], self.targets[index], BEHIND_BLOCK)
 
+    def approach(self, scene: Scene, index: int) -> float:
+        """Return the way behind the block."""
+        places = self.positions[index], self.targets[index]
+        return way_behind(scene.robot.position, *places, BEHIND_BLOCK, BEHIND_BLOCK - GAP)
+
 
 class Slide(Task):
     """Every puck has been inside its target disc, beyond the arm's reach; it is then taken off the table."""
@@ -166,6 +195,10 @@ class Slide(Task):
     separation = (0.14, 0.1)
     #: Tangent of the largest angle between the x axis and the way to the target.
     slope = 0.4
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._before: list[Point] = []
 
     def sample(self, rng: np.random.Generator, n_objects: int) -> tuple[Points, Points]:
         """Return pucks near the robot and targets out of its reach, the ways in colour order free."""
@@ -222,7 +255,7 @@ class Slide(Task):
 
     def update(self, scene: Scene) -> None:
         """Read the state of the world and take delivered pucks off the table."""
-        before = self.finished
+        before, self._before = self.finished, self.positions
         super().update(scene)
         if self.finished != before:
             for index, (old, new) in enumerate(zip(before, self.finished, strict=True)):
@@ -232,6 +265,20 @@ class Slide(Task):
     def approach_point(self, index: int) -> Point:
         """Return the point behind the puck on the line to its target."""
         return _behind(self.positions[index], self.targets[index], BEHIND_PUCK)
+
+    def approach(self, scene: Scene, index: int) -> float:
+        """Return the way behind the puck."""
+        return way_behind(
+            scene.robot.position, self.positions[index], self.targets[index], BEHIND_PUCK, BEHIND_PUCK - GAP
+        )
+
+    @property
+    def out_of_reach(self) -> bool:
+        """Whether a puck lies still, neither delivered nor where the arm can work at it: most targets are beyond."""
+        return any(
+            not finished and not in_reach(position) and math.dist(position, before) < REST_MOTION
+            for finished, position, before in zip(self.finished, self.positions, self._before, strict=True)
+        )
 
     def mark_positions(self, index: int) -> tuple[Point | None, ...]:
         """Return the target's disc and, once the puck is delivered and off the table, the place where it was."""
@@ -255,8 +302,6 @@ class Stack(Task):
     kind = ObjectKind("box", (0.02, 0.02, 0.02), mass=1.0, friction=0.5, multibody=True)
     tolerance = 0.03
     marks = (Mark("box", (0.01, 0.01, 0.01)),)
-    #: A block that moves less than this in one control step is at rest, metres.
-    rest_motion = 0.001
 
     def __init__(self) -> None:
         super().__init__()
@@ -319,6 +364,10 @@ class Stack(Task):
         """Return the block's own position."""
         return self.positions[index]
 
+    def approach(self, scene: Scene, index: int) -> float:
+        """Return the way around the block, with open fingers."""
+        return way_onto(scene.robot.position, scene.robot.width, self.positions[index], MAX_WIDTH)
+
     def mark_positions(self, index: int) -> tuple[Point | None, ...]:
         """Return a place in a small model of the tower, which stands beside it, where the gripper does not hide it."""
         x, y, _ = self.targets[index]
@@ -329,7 +378,7 @@ class Stack(Task):
         x, y, z = self.positions[index]
         gripper_x, gripper_y, gripper_z = scene.robot.position
         free = gripper_z - z > 0.03 or math.hypot(gripper_x - x, gripper_y - y) > 0.06
-        return free and math.dist(self.positions[index], self._before[index]) < self.rest_motion
+        return free and math.dist(self.positions[index], self._before[index]) < REST_MOTION
 
     def _finished(self, scene: Scene) -> list[bool]:
         there = super()._finished(scene)
