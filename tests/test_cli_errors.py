@@ -129,6 +129,7 @@ def test_text_that_is_no_plain_yaml_is_refused(text, said):
                 "policy_kwargs:dict(init_temperature=1e999)",
                 "n_envs:100000000",
                 "tasks:3",
+                "timeouts:failure",
             )
         ),
         ["train", "-n", "64", "--env-kwargs", "n_discs:nan"],

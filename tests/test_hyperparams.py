@@ -62,6 +62,14 @@ def test_linear_schedule_goes_from_one_number_to_another():
     assert [model.action_std(remaining) for remaining in (1.0, 0.5, 0.0)] == pytest.approx([0.5, 0.3, 0.1])
 
 
+def test_timeouts_are_terminal_where_a_file_or_the_command_line_says_so():
+    assert build_model(make_config("reptile_ppo", "Hanoi-v0", 0))[0].timeouts == "bootstrap"
+    for algo in ("reptile_ppo", "reptile_mlp"):
+        config = make_config(algo, "Hanoi-v0", 0, overrides={"timeouts": "terminal", "max_episode_steps": "9"})
+        model = build_model(config)[0]
+        assert (model.timeouts, model.max_episode_steps) == ("terminal", 9)
+
+
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
@@ -72,6 +80,8 @@ def test_linear_schedule_goes_from_one_number_to_another():
         ({"learning_rate": "exp_0.1"}, "lin_<from>"),
         ({"action_std": "lin_0.5_0.1_0"}, "lin_<from>"),
         ({"action_std": "lin_a"}, "lin_<from>"),
+        ({"max_episode_steps": 0}, "at least 1"),
+        ({"timeouts": "never"}, "known: bootstrap, terminal"),
         ({"meta_update": 1}, "true or false"),
         ({"policy": "ProgPol"}, "nearest: ProgPolicy"),
         ({"policy_kwargs": {"dept": 3}}, "nearest: depth"),

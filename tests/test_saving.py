@@ -81,6 +81,8 @@ def test_loaded_model_is_the_saved_one(policy, monkeypatch):
         "meta_learning_rate": FloatSchedule(LinearSchedule(0.5, 0.1, 1.0)),
         "meta_optimizer": "adam",
         "scale_rewards": True,
+        "timeouts": "terminal",
+        "max_episode_steps": 100,
         "tasks": TaskDistribution([{"n_discs": 2}, {"n_discs": np.int64(1)}], sampler="failure"),
         "policy_kwargs": {"activation_fn": th.nn.Tanh, "optimizer_kwargs": {"betas": (0.8, 0.99), "eps": 1e-5}},
         "env_kwargs": {"source": 1, "target": 0},
@@ -331,3 +333,9 @@ def test_model_trained_in_a_made_environment_is_loaded_with_another(tmp_path):
     loaded = ReptilePPO.load(tmp_path / "model.zip", env=gym.make("CartPole-v1"))
     loaded.learn(32, reset_num_timesteps=False)
     assert loaded.num_timesteps == 64
+
+
+def test_limit_of_training_episodes_is_not_that_of_an_environment_made_already():
+    limited = saved(make(max_episode_steps=7))
+    assert ReptilePPO.load(limited, env="Hanoi-v0").max_episode_steps == 7
+    assert ReptilePPO.load(limited, env=gym.make("Hanoi-v0")).max_episode_steps is None

@@ -14,12 +14,11 @@ from progpolicy_envs.planning import PlanningEnv
 from progpolicy_envs.rendering import hanoi_frame
 from progpolicy_envs.states import is_sequence
 from progpolicy_envs.symmetry import Permutation, Symmetry
-from progpolicy_envs.variation import IntParameter, Variation, VariationSpace
+from progpolicy_envs.variation import RANDOM, IntParameter, Variation, VariationSpace
 from progpolicy_envs.vector import PlanningVectorEnv
 
 MAX_DISCS = 12
 N_PEGS = 3
-RANDOM = "random"
 MOVES: tuple[tuple[int, int], ...] = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 _N_TOPS = MAX_DISCS + 1  # a peg's top disc, or none
 STEP_REWARD, ILLEGAL_REWARD, GOAL_REWARD = -0.01, -0.05, 1.0
@@ -130,7 +129,8 @@ class HanoiEnv(PlanningEnv):
     ## Starting State
     All discs on the source peg. Source and target are fixed or, where they are ``"random"``, drawn for each episode,
     which shows a policy the same puzzle from all sides. ``env.reset(options={"discs": [1, 0, 0]})`` starts from any
-    legal state: the peg of each disc, the smallest first.
+    legal state: the peg of each disc, the smallest first. Other domains have ``n_done``; a tower has not: its discs are
+    not done one after another, and a tower whose largest discs are in place is one of fewer discs.
 
     ## Episode End
     Terminated when all discs lie on the target peg; truncated after 500 steps (``max_episode_steps``).

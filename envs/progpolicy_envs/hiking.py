@@ -73,6 +73,7 @@ _SECTIONS = {
         ## Starting State
         The hiker stands on the map's start, the stars lie on different pathway cells drawn with the environment's
         generator. With ``layout="random"`` each episode also draws one of 1024 generated maps.
+        With ``n_done`` above 0 so many stars have been collected, and the hiker stands where the last of them was.
         ``env.reset(options={"hiker": [0, 1], "stars": [[0, 3], [2, 2]]})`` gives the places instead, as rows and
         columns; of ``n_stars`` stars those that are left out have been collected.
 
@@ -88,10 +89,12 @@ _SECTIONS = {
         force until it is changed. Values that are not accepted raise ``ValueError``.
         ``context="observed"``, for ``gym.make``, adds the variation's numbers, from 0 to 1, to the end of observations.
 
-        | Parameter   | Values                                                          | Default | Meaning         |
-        |-------------|-----------------------------------------------------------------|---------|-----------------|
-        | n_stars     | 1 to 12                                                         | 3       | number of stars |
-        | layout      | valley, spiral, comb, fork, lakeside, random or a map as a text | valley  | the map         |
+        | Parameter   | Values                                                          | Default | Meaning            |
+        |-------------|-----------------------------------------------------------------|---------|--------------------|
+        | n_stars     | 1 to 12                                                         | 3       | number of stars    |
+        | layout      | valley, spiral, comb, fork, lakeside, random or a map as a text | valley  | the map            |
+        | n_done      | 0 to 11, fewer than n_stars, or "random": drawn for every       | 0       | stars that have    |
+        |             | episode. Not in ``context``                                     |         | been collected     |
 
         A map of your own is a text with line feeds, or a sequence of rows: up to 8 rows of equal length, up to 10
         characters. ``.`` is a pathway, ``#`` rock, ``~`` water, and ``H`` the start, of which there is one; beyond the
@@ -162,9 +165,10 @@ class HikingEnv(_WholeMap, PathwayEnv):
         render_mode: str | None = None,
         context: str = "hidden",
         observation: None = None,
+        n_done: int | str = 0,
     ) -> None:
         _refuse_observation(observation)
-        super().__init__(n_stars, layout, render_mode, context)
+        super().__init__(n_stars, layout, render_mode, context, n_done)
 
     def _seen(self, numbers: NDArray[np.float32]) -> NDArray[np.float32]:
         return numbers
@@ -219,9 +223,10 @@ class HikingVectorEnv(_WholeMap, PathwayVectorEnv):
         max_episode_steps: int | None = None,
         context: str = "hidden",
         observation: None = None,
+        n_done: int | str = 0,
     ) -> None:
         _refuse_observation(observation)
-        super().__init__(num_envs, n_stars, layout, max_episode_steps, context)
+        super().__init__(num_envs, n_stars, layout, max_episode_steps, context, n_done)
 
     def _observe(self) -> NDArray[np.float32]:
         return self._numbers.copy()

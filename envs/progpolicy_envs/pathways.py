@@ -33,11 +33,19 @@ from progpolicy_envs.planners import hiking as planner
 from progpolicy_envs.planning import PlanningEnv
 from progpolicy_envs.rendering import hiking_frame
 from progpolicy_envs.states import is_sequence, read_cell
-from progpolicy_envs.variation import ChoiceParameter, IntParameter, Variation, VariationSpace
+from progpolicy_envs.variation import (
+    RANDOM,
+    ChoiceParameter,
+    IntParameter,
+    Variation,
+    VariationSpace,
+    check_n_done,
+    draw_n_done,
+    n_done_parameter,
+)
 from progpolicy_envs.vector import PlanningVectorEnv
 
 MAX_STARS = 12
-RANDOM = "random"
 STEP_REWARD, ILLEGAL_REWARD, STAR_REWARD = -0.01, -0.05, 1.0
 
 ACTION_NAMES = tuple(DIRECTIONS)
@@ -82,7 +90,8 @@ def named_layout(value: str) -> Layout:
 
 
 def _check_variation(variation: Variation) -> None:
-    """Raise ``ValueError`` if the map has fewer places for stars than there are stars."""
+    """Raise ``ValueError`` if the map has fewer places for stars than there are stars, or none is left to collect."""
+    check_n_done(variation, "n_stars")
     n_stars, layout = variation["n_stars"], variation["layout"]
     n_places = MAX_STARS if layout == RANDOM else len(named_layout(layout).star_cells)
     if n_stars > n_places:
@@ -92,6 +101,7 @@ def _check_variation(variation: Variation) -> None:
 VARIATIONS = VariationSpace(
     IntParameter("n_stars", 1, MAX_STARS, 3, "number of stars"),
     LayoutParameter("layout", (*LAYOUTS, RANDOM), "valley", "the map; 'random' draws another one for every episode"),
+    n_done_parameter(MAX_STARS - 1, "stars that have been collected"),
     check=_check_variation,
     starts={
         "hiker": "row and column of the hiker",
@@ -100,15 +110,21 @@ VARIATIONS = VariationSpace(
 )
 
 
-def draw_task(generator: np.random.Generator, variation: Variation) -> tuple[Layout, NDArray[np.int64]]:
-    """Draw the map, where it is random, and the cells of the stars.
+def draw_task(
+    generator: np.random.Generator, variation: Variation
+) -> tuple[int, Layout, int | np.int64, NDArray[np.int64]]:
+    """Draw the number of stars, the map, where it is random, the hiker's cell and the cells of the stars that are left.
+
+    The hiker stands on the map's start or, if stars have been collected, where the last of them was.
 
     :param generator: the environment's generator
-    :param variation: values of ``n_stars`` and ``layout``
+    :param variation: values of ``n_stars``, ``layout`` and ``n_done``
     """
     value = variation["layout"]
     layout = random_layout(int(generator.integers(N_RANDOM_LAYOUTS))) if value == RANDOM else named_layout(value)
-    return layout, generator.permutation(layout.star_cells)[: variation["n_stars"]]
+    stars = generator.permutation(layout.star_cells)[: variation["n_stars"]]
+    n_done = draw_n_done(variation, "n_stars", generator)
+    return len(stars), layout, stars[n_done - 1] if n_done else layout.start, stars[n_done:]
 
 
 def layout_value(layout: Layout) -> str:
@@ -182,8 +198,10 @@ class PathwayEnv(MapView, PlanningEnv):
         layout: str | Sequence[str] = "valley",
         render_mode: str | None = None,
         context: str = "hidden",
+        n_done: int | str = 0,
     ) -> None:
-        super().__init__({"n_stars": n_stars, "layout": layout}, _OBSERVATION_SPACE, render_mode, context)
+        variation = {"n_stars": n_stars, "layout": layout, "n_done": n_done}
+        super().__init__(variation, _OBSERVATION_SPACE, render_mode, context)
         self.action_space = spaces.Discrete(len(ACTION_NAMES))
         self.n_stars = 0
         self.hiker = 0
@@ -210,8 +228,8 @@ class PathwayEnv(MapView, PlanningEnv):
         return self._observation(), reward, solved, False, {"is_success": solved}
 
     def _draw(self, variation: Variation) -> None:
-        layout, stars = draw_task(self.np_random, variation)
-        self._place(len(stars), layout, layout.start, stars.tolist())
+        n_stars, layout, hiker, stars = draw_task(self.np_random, variation)
+        self._place(n_stars, layout, int(hiker), stars.tolist())
 
     def _state(self) -> dict[str, Any]:
         return {
@@ -270,6 +288,8 @@ class PathwayVectorEnv(MapView, PlanningVectorEnv):
     :param n_stars: number of stars
     :param layout: the map
     :param max_episode_steps: steps after which an episode is truncated; ``None`` for no limit
+    :param context: whether observations end with the variation's numbers
+    :param n_done: stars that have been collected at the start
     """
 
     variations: ClassVar[VariationSpace] = VARIATIONS
@@ -282,8 +302,9 @@ class PathwayVectorEnv(MapView, PlanningVectorEnv):
         layout: str | Sequence[str] = "valley",
         max_episode_steps: int | None = None,
         context: str = "hidden",
+        n_done: int | str = 0,
     ) -> None:
-        variation = self.variations.update({}, {"n_stars": n_stars, "layout": layout})
+        variation = self.variations.update({}, {"n_stars": n_stars, "layout": layout, "n_done": n_done})
         actions = spaces.Discrete(len(ACTION_NAMES))
         super().__init__(num_envs, _OBSERVATION_SPACE, actions, variation, max_episode_steps, context)
         self._numbers = np.full((num_envs, self.n_numbers), BLOCKED, dtype=np.float32)
@@ -295,26 +316,34 @@ class PathwayVectorEnv(MapView, PlanningVectorEnv):
 
     def _reset_rows(self, rows: NDArray[np.intp]) -> None:
         for row in rows:
-            layout, stars = draw_task(self._generators[row], self.row_variations[row])
-            self._place(row, layout, layout.start, stars)
+            _, layout, hiker, stars = draw_task(self._generators[row], self.row_variations[row])
+            self._place(row, layout, hiker, stars)
 
     @classmethod
     def count_starts(cls, variation: Mapping[str, Any], any_state: bool = False) -> int:
-        """Return the number of sets of stars on a map, see :class:`PlanningVectorEnv`."""
+        """Return the number of sets of stars on a map, each with every place of a hiker who has collected some already.
+
+        See :class:`PlanningVectorEnv`.
+        """
         whole = cls.variations.update(cls.variations.defaults, variation)
-        if any_state or whole["layout"] == RANDOM:
+        n_done = whole.get("n_done", 0)
+        if any_state or RANDOM in (whole["layout"], n_done):
             return super().count_starts(variation, any_state)
-        return math.comb(len(named_layout(whole["layout"]).star_cells), whole["n_stars"])
+        n_cells, n_left = len(named_layout(whole["layout"]).star_cells), whole["n_stars"] - n_done
+        return math.comb(n_cells, n_left) * (n_cells - n_left if n_done else 1)
 
     def _put_starts(
         self, variation: Variation, given: Mapping[str, Any], numbers: NDArray[np.int64], any_state: bool
     ) -> None:
         layout = named_layout(variation["layout"])
-        cells = np.array(layout.star_cells)
-        for row, chosen in enumerate(subsets(numbers, len(cells), variation["n_stars"])):
-            self._place(row, layout, layout.start, cells[chosen])
+        cells, n_done = np.array(layout.star_cells), variation.get("n_done", 0)
+        n_left = variation["n_stars"] - n_done
+        numbers, places = np.divmod(numbers, len(cells) - n_left) if n_done else (numbers, numbers)
+        for row, chosen in enumerate(subsets(numbers, len(cells), n_left)):
+            hiker = np.delete(cells, chosen)[places[row]] if n_done else layout.start
+            self._place(row, layout, hiker, cells[chosen])
 
-    def _place(self, row: int | np.intp, layout: Layout, hiker: int, stars: NDArray[np.int64]) -> None:
+    def _place(self, row: int | np.intp, layout: Layout, hiker: int | np.int64, stars: NDArray[np.int64]) -> None:
         numbers, places = self._numbers[row], self.places
         numbers[:] = self.ground(layout)
         numbers[places[stars]] = self.star_value

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,7 +18,15 @@ from progpolicy_envs.planning import PlanningEnv
 from progpolicy_envs.rendering import stacking_frame
 from progpolicy_envs.states import Cell, is_sequence, read_cell
 from progpolicy_envs.symmetry import Grid, Permutation, Symmetry
-from progpolicy_envs.variation import IntParameter, Variation, VariationSpace
+from progpolicy_envs.variation import (
+    RANDOM,
+    IntParameter,
+    Variation,
+    VariationSpace,
+    check_n_done,
+    draw_n_done,
+    n_done_parameter,
+)
 from progpolicy_envs.vector import PlanningVectorEnv
 
 MAX_PLATES = 8
@@ -26,6 +35,8 @@ N_CELLS = N_SIDE**2
 PICK = planner.PICK
 VARIATIONS = VariationSpace(
     IntParameter("n_plates", 1, MAX_PLATES, 3, "number of plates"),
+    n_done_parameter(MAX_PLATES - 1, "plates that are on the stack"),
+    check=partial(check_n_done, size="n_plates"),
     starts={
         "plates": "row and column of each plate on the table, the largest first",
         "gripper": "row and column of the gripper",
@@ -78,13 +89,14 @@ SYMMETRIES = (
 GRIDS = (Grid.whole("table", 0, N_SIDE, N_SIDE),)
 
 
-def draw_task(generator: np.random.Generator, variation: Variation) -> tuple[NDArray[np.int64], int]:
-    """Draw the cells of the plates, the largest first, and the cell of the gripper.
+def draw_task(generator: np.random.Generator, variation: Variation) -> tuple[NDArray[np.int64], int, int]:
+    """Draw the cells of the plates, the largest first, the cell of the gripper, and how many are on the stack.
 
     :param generator: the environment's generator
-    :param variation: the value of ``n_plates``
+    :param variation: the values of ``n_plates`` and ``n_done``
     """
-    return generator.permutation(N_CELLS)[: variation["n_plates"]], int(generator.integers(N_CELLS))
+    plates, gripper = generator.permutation(N_CELLS)[: variation["n_plates"]], int(generator.integers(N_CELLS))
+    return plates, gripper, draw_n_done(variation, "n_plates", generator)
 
 
 def read_state(state: Mapping[str, Any]) -> tuple[int, list[Cell], Cell]:
@@ -93,7 +105,7 @@ def read_state(state: Mapping[str, Any]) -> tuple[int, list[Cell], Cell]:
     :param state: values of ``n_plates``, ``plates`` and ``gripper``; see :attr:`StackingEnv.state`
     :raises ValueError: if it is not a state
     """
-    n_plates = VARIATIONS.update({}, {"n_plates": state["n_plates"]})["n_plates"]
+    n_plates = VARIATIONS.parse({"n_plates": state["n_plates"]})["n_plates"]
     plates, gripper = state["plates"], state["gripper"]
     if not is_sequence(plates) or len(plates) > n_plates:
         raise ValueError(
@@ -145,7 +157,8 @@ class StackingEnv(PlanningEnv):
     the table is not; nothing changes then), +1 for each plate picked up.
 
     ## Starting State
-    Plates and gripper on cells drawn with the environment's generator; the gripper may start above a plate.
+    Plates and gripper on cells drawn with the environment's generator; the gripper may start above a plate. The
+    ``n_done`` largest plates are on the stack already.
     ``env.reset(options={"n_plates": 2, "plates": [[0, 0], [3, 4]], "gripper": [2, 2]})`` gives them instead, as rows
     and columns, the largest plate first; of ``n_plates`` plates those that are left out are on the stack.
 
@@ -161,9 +174,11 @@ class StackingEnv(PlanningEnv):
     it is changed. Values that are not accepted raise ``ValueError``.
     ``context="observed"``, for ``gym.make``, adds the variation's numbers, from 0 to 1, to the end of observations.
 
-    | Parameter | Values | Default | Meaning          |
-    |-----------|--------|---------|------------------|
-    | n_plates  | 1 to 8 | 3       | number of plates |
+    | Parameter | Values             | Default | Meaning                                                              |
+    |-----------|--------------------|---------|----------------------------------------------------------------------|
+    | n_plates  | 1 to 8             | 3       | number of plates                                                     |
+    | n_done    | 0 to 7, "random"   | 0       | plates that are on the stack at the start, fewer than n_plates;      |
+    |           |                    |         | "random" draws a number for every episode. Not in ``context``        |
 
     ## References
     Compare the domain `blocks` of PDDLGym (Silver and Chitnis, 2020).
@@ -179,8 +194,10 @@ class StackingEnv(PlanningEnv):
     symmetries: ClassVar[tuple[Symmetry, ...]] = SYMMETRIES
     grids: ClassVar[tuple[Grid, ...]] = GRIDS
 
-    def __init__(self, n_plates: int = 3, render_mode: str | None = None, context: str = "hidden") -> None:
-        super().__init__({"n_plates": n_plates}, _OBSERVATION_SPACE, render_mode, context)
+    def __init__(
+        self, n_plates: int = 3, render_mode: str | None = None, context: str = "hidden", n_done: int | str = 0
+    ) -> None:
+        super().__init__({"n_plates": n_plates, "n_done": n_done}, _OBSERVATION_SPACE, render_mode, context)
         self.action_space = spaces.Discrete(len(ACTION_NAMES))
         self.n_plates = 0
         self.plates: list[Cell] = []
@@ -213,9 +230,9 @@ class StackingEnv(PlanningEnv):
         return self._observation(), reward, solved, False, {"is_success": solved}
 
     def _draw(self, variation: Variation) -> None:
-        cells, gripper = draw_task(self.np_random, variation)
+        cells, gripper, n_done = draw_task(self.np_random, variation)
         self.n_plates = len(cells)
-        self.plates = [divmod(cell, N_SIDE) for cell in cells.tolist()]
+        self.plates = [divmod(cell, N_SIDE) for cell in cells[n_done:].tolist()]
         self.gripper = divmod(gripper, N_SIDE)
 
     def _state(self) -> dict[str, Any]:
@@ -263,6 +280,8 @@ class StackingVectorEnv(PlanningVectorEnv):
     :param num_envs: number of environments
     :param n_plates: see :class:`StackingEnv`
     :param max_episode_steps: steps after which an episode is truncated; ``None`` for no limit
+    :param context: see :class:`StackingEnv`
+    :param n_done: see :class:`StackingEnv`
     """
 
     variations: ClassVar[VariationSpace] = VARIATIONS
@@ -277,8 +296,9 @@ class StackingVectorEnv(PlanningVectorEnv):
         n_plates: int = 3,
         max_episode_steps: int | None = None,
         context: str = "hidden",
+        n_done: int | str = 0,
     ) -> None:
-        variation = self.variations.update({}, {"n_plates": n_plates})
+        variation = self.variations.update({}, {"n_plates": n_plates, "n_done": n_done})
         actions = spaces.Discrete(len(ACTION_NAMES))
         super().__init__(num_envs, _OBSERVATION_SPACE, actions, variation, max_episode_steps, context)
         self._numbers = np.zeros((num_envs, len(OBSERVATION_NAMES)), dtype=np.float32)
@@ -288,34 +308,45 @@ class StackingVectorEnv(PlanningVectorEnv):
         self._plates: list[NDArray[np.int64]] = [np.zeros(0, dtype=np.int64)] * num_envs
 
     def _reset_rows(self, rows: NDArray[np.intp]) -> None:
-        self._numbers[rows] = 0
         for row in rows:
-            plates, gripper = draw_task(self._generators[row], self.row_variations[row])
-            self._numbers[row, plates] = DOMINANCE ** -np.arange(len(plates))
+            plates, gripper, n_done = draw_task(self._generators[row], self.row_variations[row])
+            self._put(row, plates, n_done)
             self._grippers[row] = divmod(gripper, N_SIDE)
-            self._plates[row], self._n_plates[row] = plates, len(plates)
-        self._n_picked[rows] = 0
         self._show_grippers()
+
+    def _put(self, row: int | np.intp, plates: NDArray[np.int64], n_picked: int) -> None:
+        """Put the plates of one environment onto their cells, the first of them onto the stack."""
+        numbers, n_plates = self._numbers[row], len(plates)
+        numbers[:] = 0
+        numbers[plates[n_picked:]] = DOMINANCE ** -np.arange(n_plates - n_picked)
+        if n_picked:
+            numbers[_STACK : _STACK + n_picked] = (n_plates - np.arange(n_picked)) / n_plates
+        self._plates[row], self._n_plates[row], self._n_picked[row] = plates, n_plates, n_picked
 
     @classmethod
     def count_starts(cls, variation: Mapping[str, Any], any_state: bool = False) -> int:
         """Return the number of places for plates and gripper, see :class:`PlanningVectorEnv`."""
         if any_state:
             return super().count_starts(variation, any_state)
-        n_plates = cls.variations.update(cls.variations.defaults, variation)["n_plates"]
-        return math.perm(N_CELLS, n_plates) * N_CELLS
+        whole = cls.variations.update(cls.variations.defaults, variation)
+        n_done = whole.get("n_done", 0)
+        if n_done == RANDOM:
+            return super().count_starts(variation, any_state)
+        return math.perm(N_CELLS, whole["n_plates"] - n_done) * N_CELLS
 
     def _put_starts(
         self, variation: Variation, given: Mapping[str, Any], numbers: NDArray[np.int64], any_state: bool
     ) -> None:
         arrangement, gripper = np.divmod(numbers, N_CELLS)
-        n_plates = variation["n_plates"]
-        plates = arrangements(arrangement, N_CELLS, n_plates)
+        n_plates, n_done = variation["n_plates"], variation.get("n_done", 0)
+        plates = arrangements(arrangement, N_CELLS, n_plates - n_done)
         self._numbers[:] = 0
-        self._numbers[self._rows[:, None], plates] = DOMINANCE ** -np.arange(n_plates)
+        self._numbers[self._rows[:, None], plates] = DOMINANCE ** -np.arange(n_plates - n_done)
+        self._numbers[:, _STACK : _STACK + n_done] = (n_plates - np.arange(n_done)) / n_plates
         self._grippers = np.stack(np.divmod(gripper, N_SIDE), axis=1)
-        self._plates = list(plates)
-        self._n_plates[:], self._n_picked[:] = n_plates, 0
+        # Where the plates lay that are on the stack already does not matter.
+        self._plates = list(np.concatenate([np.full((len(plates), n_done), -1), plates], axis=1))
+        self._n_plates[:], self._n_picked[:] = n_plates, n_done
         self._show_grippers()
 
     def _move(self, actions: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -349,12 +380,8 @@ class StackingVectorEnv(PlanningVectorEnv):
     def _set_state_of(self, row: int, state: Mapping[str, Any]) -> None:
         n_plates, plates, gripper = read_state(state)
         n_picked, cells = n_plates - len(plates), [row * N_SIDE + column for row, column in plates]
-        self._n_picked[row], self._grippers[row] = n_picked, gripper
-        # Where the plates lay that are on the stack already does not matter.
-        self._plates[row] = np.array([-1] * n_picked + cells)
-        self._numbers[row] = 0
-        self._numbers[row, cells] = DOMINANCE ** -np.arange(len(cells))
-        self._numbers[row, _STACK : _STACK + n_picked] = (n_plates - np.arange(n_picked)) / n_plates
+        self._put(row, np.array([-1] * n_picked + cells), n_picked)
+        self._grippers[row] = gripper
         self._show_grippers()
 
     def _optimal_steps(self) -> NDArray[np.int64]:

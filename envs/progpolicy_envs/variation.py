@@ -27,6 +27,8 @@ class IntParameter:
     :param default: of the constructor
     :param description: in a few words
     :param names: accepted in place of a number
+    :param of_start: whether it is of an episode's start and not of the task: then it is left out of a variation while
+        it has its default, and is not among the numbers that ``context="observed"`` shows
     """
 
     name: str
@@ -35,6 +37,7 @@ class IntParameter:
     default: int | str
     description: str
     names: tuple[str, ...] = ()
+    of_start: bool = False
 
     kind: ClassVar[str] = "integer"
 
@@ -46,7 +49,7 @@ class IntParameter:
     @property
     def context_names(self) -> tuple[str, ...]:
         """Names of the numbers that :meth:`encode` returns."""
-        return (self.name, *(f"{self.name}={name}" for name in self.names))
+        return () if self.of_start else (self.name, *(f"{self.name}={name}" for name in self.names))
 
     def encode(self, value: int | str) -> list[float]:
         """Return a value as numbers from 0 to 1: where it lies between the bounds, then one for each of the names.
@@ -67,6 +70,42 @@ class IntParameter:
         if isinstance(value, bool) or not isinstance(value, Integral) or not self.low <= int(value) <= self.high:
             raise ValueError(f"{self.name}={value!r} is not accepted; {self.name} is {self.allowed}")
         return int(value)
+
+
+#: Value of a parameter that is drawn anew for each episode.
+RANDOM = "random"
+
+
+def n_done_parameter(most: int, things: str) -> IntParameter:
+    """Return the parameter that says how many things are done with when an episode begins; 0 where it is left out.
+
+    :param most: one less than the largest number of things
+    :param things: what they are and when they are done, such as ``"plates on the stack"``
+    """
+    description = f"{things} at the start, fewer than there are; 'random' draws a number for every episode"
+    return IntParameter("n_done", 0, most, 0, description, (RANDOM,), of_start=True)
+
+
+def check_n_done(variation: Mapping[str, Any], size: str) -> None:
+    """Raise ``ValueError`` unless something is left to be done.
+
+    :param variation: with the size
+    :param size: name of the number of things
+    """
+    n_done = variation.get("n_done", 0)
+    if n_done != RANDOM and n_done >= variation[size]:
+        raise ValueError(f"n_done={n_done} is not accepted with {size}={variation[size]}; n_done is less than {size}")
+
+
+def draw_n_done(variation: Mapping[str, Any], size: str, rng: np.random.Generator) -> int:
+    """Return how many things are done with when an episode begins; nothing is drawn for a number.
+
+    :param variation: with the size
+    :param size: name of the number of things
+    :param rng: source of randomness
+    """
+    n_done = variation.get("n_done", 0)
+    return int(variation[size] * rng.random()) if n_done == RANDOM else int(n_done)
 
 
 @dataclass(frozen=True)
@@ -167,7 +206,7 @@ class VariationSpace(Mapping[str, Parameter]):
         :raises ValueError: if a name is unknown, a value is not accepted, or the values do not fit together; the
             message names the parameter, the value and what is allowed
         """
-        updated = {**variation, **self.parse(changes or {})}
+        updated = self._without_defaults({**variation, **self.parse(changes or {})})
         if self._check:
             self._check(updated)
         return updated
@@ -183,7 +222,7 @@ class VariationSpace(Mapping[str, Parameter]):
     @property
     def defaults(self) -> Variation:
         """The variation of an environment that is made without arguments."""
-        return {name: parameter.default for name, parameter in self.items()}
+        return self._without_defaults({name: parameter.default for name, parameter in self.items()})
 
     @property
     def context_names(self) -> tuple[str, ...]:
@@ -193,11 +232,17 @@ class VariationSpace(Mapping[str, Parameter]):
     def encode(self, variation: Mapping[str, Any]) -> NDArray[np.float32]:
         """Return a variation as numbers from 0 to 1, which a policy may be shown.
 
-        :param variation: a value for every parameter
+        :param variation: a value for every parameter that has such numbers
         :return: ``(len(context_names),)``
         """
-        numbers = [number for name, parameter in self.items() for number in parameter.encode(variation[name])]
+        shown = {name: parameter for name, parameter in self.items() if parameter.context_names}
+        numbers = [number for name, parameter in shown.items() for number in parameter.encode(variation[name])]
         return np.array(numbers, dtype=np.float32)
+
+    def _without_defaults(self, variation: Variation) -> Variation:
+        """Return a variation without parameters of the start that have their defaults."""
+        left_out = [name for name, known in self.items() if isinstance(known, IntParameter) and known.of_start]
+        return {name: value for name, value in variation.items() if name not in left_out or value != self[name].default}
 
     def _named(self, name: str) -> Parameter:
         if name not in self._parameters:

@@ -6,7 +6,7 @@ import inspect
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, get_args
 
 import torch as th
 from gymnasium.envs.registration import load_env_creator
@@ -18,6 +18,7 @@ from sb3_progpolicy.hyperparams import load_hyperparams, parse_kwargs, parse_num
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.reptile.callback import ReptileWrapper
 from sb3_progpolicy.reptile_ppo.environments import DEFAULT_N_ENVS
+from sb3_progpolicy.reptile_ppo.sequence_ppo import Timeouts
 
 #: Hyperparameters of ReptileWrapper, which a stock algorithm is trained with if any of them is given.
 REPTILE = ("tasks", "inner_updates", "tasks_per_iteration", "meta_learning_rate", "meta_optimizer", "meta_update")
@@ -52,12 +53,15 @@ _BOUNDS = {
     "n_envs": (1, MAX_ENVS),
     "n_steps": (1, MAX_ROLLOUT),
     "n_timesteps": (1, 2**53),
+    "max_episode_steps": (1, 2**53),
 }
 # Arguments of the constructors that have a flag of their own or no place in a file.
 _ELSEWHERE = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
 _ELSEWHERE |= {f"{kind}_buffer_{part}" for kind in ("rollout", "replay") for part in ("class", "kwargs")} | {
     "action_noise"
 }
+# Texts of which there are few.
+_CHOICES = {"timeouts": get_args(Timeouts)}
 # Texts that may be numbers, too.
 _TEXT_OR_NUMBER = ("ent_coef", "target_entropy", "goal_scale")
 
@@ -224,7 +228,7 @@ def _checked(name: str, value: Any, default: Any) -> Any:
         if not isinstance(value, bool):
             raise ValueError(f"{name}={shortened(value)} is not accepted; it is true or false")
         return value
-    if isinstance(default, int) or name in ("batch_size", "n_envs"):
+    if isinstance(default, int) or name in ("batch_size", "n_envs", "max_episode_steps"):
         number = _number(name, value, "a whole number", (1, math.inf))
         if number != int(number):
             raise ValueError(f"{name}={shortened(value)} is not accepted; it is a whole number")
@@ -235,6 +239,8 @@ def _checked(name: str, value: Any, default: Any) -> Any:
         return _number(name, value, "a text or a number")
     if isinstance(default, str) and not isinstance(value, str):
         raise ValueError(f"{name}={shortened(value)} is not accepted; it is a text")
+    if name in _CHOICES and value not in _CHOICES[name]:
+        raise unknown(name, value, _CHOICES[name])
     return value
 
 

@@ -25,7 +25,13 @@ from sb3_progpolicy.reptile.checks import check_variations
 from sb3_progpolicy.reptile.statistics import EpisodeStatistics
 from sb3_progpolicy.reptile.steps import MetaOptimizer, MetaOptimizerName, Task, begin_task
 from sb3_progpolicy.reptile.tasks import TaskDistribution, default_tasks
-from sb3_progpolicy.reptile_ppo.environments import check_persistence, make_venv, symmetries_of, with_history
+from sb3_progpolicy.reptile_ppo.environments import (
+    check_persistence,
+    make_venv,
+    symmetries_of,
+    with_history,
+    with_limit,
+)
 from sb3_progpolicy.reptile_ppo.initial import initial_policy_kwargs, read_initial_program, start_from_program
 from sb3_progpolicy.reptile_ppo.inner_loops import (
     EngineName,
@@ -34,7 +40,7 @@ from sb3_progpolicy.reptile_ppo.inner_loops import (
     inner_updates_of_batch,
     open_inner_loops,
 )
-from sb3_progpolicy.reptile_ppo.sequence_ppo import default_batch_size
+from sb3_progpolicy.reptile_ppo.sequence_ppo import Timeouts, default_batch_size
 from sb3_progpolicy.reptile_ppo.stored_ppo import StoredPPO
 from sb3_progpolicy.reptile_ppo.theta import Theta
 
@@ -92,6 +98,7 @@ class ReptilePPO(StoredPPO):
     :param tasks: a :class:`TaskDistribution`, or what makes one; by default the domain's training variations
     :param n_envs: number of environments to build for an id; 32 by default
     :param env_kwargs: constructor arguments for an id
+    :param max_episode_steps: limit of an id's training episodes, in place of the registered one
     :param inner_updates: k, PPO updates per meta-iteration
     :param tasks_per_iteration: tasks of a meta-iteration, dealt out over the environments; see :class:`ReptileWrapper`
     :param meta_learning_rate: beta, a number or a schedule
@@ -121,6 +128,8 @@ class ReptilePPO(StoredPPO):
     :param normalize_observations: shift and scale observations by running statistics, which are folded into the program
         that is extracted; by default for a program, and not for a network
     :param scale_rewards: divide rewards by the running deviation of the return
+    :param timeouts: where a limit of steps cuts an episode short, ``"bootstrap"`` adds the value of its last state, as
+        PPO does; ``"terminal"`` adds nothing, so that not to reach a goal in time is to fail (Pardo et al., 2018)
     :param stats_window_size: episodes averaged in the logs
     :param tensorboard_log: folder of the TensorBoard logs
     :param policy_kwargs: arguments of the policy, such as ``depth``, ``cell`` and ``condition_size``
@@ -158,6 +167,7 @@ class ReptilePPO(StoredPPO):
         tasks: TaskDistribution | Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
         n_envs: int | None = None,
         env_kwargs: Mapping[str, Any] | None = None,
+        max_episode_steps: int | None = None,
         inner_updates: int = 4,
         tasks_per_iteration: int = 4,
         meta_learning_rate: float | Schedule = 0.5,
@@ -175,6 +185,7 @@ class ReptilePPO(StoredPPO):
         interaction_history: bool = True,
         normalize_observations: bool | None = None,
         scale_rewards: bool = False,
+        timeouts: Timeouts = "bootstrap",
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -191,7 +202,8 @@ class ReptilePPO(StoredPPO):
         self.env_by_id = isinstance(env, str)
         self.env_id = env if isinstance(env, str) else env_id_of(env)
         self.interaction_history = interaction_history
-        self.env_kwargs = dict(env_kwargs or {})
+        self.env_kwargs, self.max_episode_steps = dict(env_kwargs or {}), max_episode_steps
+        made_with = with_limit(self.env_kwargs, max_episode_steps)
         if tasks is None:
             tasks = default_tasks(self.env_id)
         tasks = tasks if isinstance(tasks, TaskDistribution) else TaskDistribution(tasks)
@@ -199,7 +211,7 @@ class ReptilePPO(StoredPPO):
         venv = None
         if env is not None:
             remade = self.tasks.apply == "constructor"
-            venv = with_history(make_venv(env, n_envs, seed, env_kwargs or {}, remade), interaction_history)
+            venv = with_history(make_venv(env, n_envs, seed, made_with, remade), interaction_history)
         policy_class = self._get_policy_from_name(policy) if isinstance(policy, str) else policy
         learns_program = issubclass(policy_class, ProgrammaticActorCritic)
         if batch_size is None:
@@ -208,9 +220,8 @@ class ReptilePPO(StoredPPO):
             learning_rate = 2e-2 if learns_program else 3e-4
         if normalize_observations is None:
             normalize_observations = learns_program and init_program is None
-        policy_kwargs = dict(policy_kwargs or {})
+        policy_kwargs, self.symmetric = dict(policy_kwargs or {}), symmetric
         check_persistence(policy_kwargs, interaction_history)
-        self.symmetric = symmetric
         if symmetric and "symmetries" not in policy_kwargs:
             policy_kwargs["symmetries"] = symmetries_of(self.env_id, venv)
         if normalize_observations:
@@ -239,6 +250,7 @@ class ReptilePPO(StoredPPO):
             action_temperature=action_temperature,
             action_std=action_std,
             scale_rewards=scale_rewards,
+            timeouts=timeouts,
             learning_rate=learning_rate,
             n_steps=n_steps,
             batch_size=batch_size,
@@ -410,5 +422,6 @@ class ReptilePPO(StoredPPO):
         """
         self.env_by_id = made = isinstance(env, str)
         remade = self.tasks.apply == "constructor"
-        venv = make_venv(env, self.n_envs if made else None, self.seed, self.env_kwargs if made else {}, remade)
+        made_with = with_limit(self.env_kwargs, self.max_episode_steps) if made else {}
+        venv = make_venv(env, self.n_envs if made else None, self.seed, made_with, remade)
         super().set_env(with_history(venv, self.interaction_history), force_reset)

@@ -39,8 +39,24 @@ def make_venv(
             return make_vec_env(partial(RemakeOnVariation, env, **env_kwargs), number, seed)
         return make_fast_vec_env(env, number, seed, **env_kwargs)
     if n_envs is not None or env_kwargs:
-        raise ValueError("n_envs and env_kwargs are for environment ids; the environment given is already made")
+        raise ValueError(
+            "n_envs, env_kwargs and max_episode_steps are for environment ids; the environment given is already made"
+        )
     return PPO._wrap_env(env)
+
+
+def with_limit(env_kwargs: Mapping[str, Any], max_episode_steps: int | None) -> dict[str, Any]:
+    """Return constructor arguments with a limit of steps.
+
+    :param env_kwargs: without
+    :param max_episode_steps: at least 1; ``None`` for the one that is registered
+    :raises ValueError: if it is not accepted
+    """
+    if max_episode_steps is None:
+        return dict(env_kwargs)
+    if isinstance(max_episode_steps, bool) or not isinstance(max_episode_steps, int) or max_episode_steps < 1:
+        raise ValueError(f"max_episode_steps={max_episode_steps!r} is not accepted; it is at least 1, or None")
+    return {**env_kwargs, "max_episode_steps": max_episode_steps}
 
 
 def with_history(venv: VecEnv, interaction_history: bool) -> VecEnv:

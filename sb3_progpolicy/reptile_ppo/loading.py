@@ -150,8 +150,9 @@ def _make(
         arguments.setdefault("n_envs", state["n_envs"])
         if env.rpartition(":")[2] != (state.get("env_id") or "").rpartition(":")[2]:
             arguments["env_kwargs"] = changes.get("env_kwargs")  # those saved are another environment's
-    elif env is not None and "env_kwargs" not in changes:
-        arguments.pop("env_kwargs", None)
+    elif env is not None:
+        for name in {"env_kwargs", "max_episode_steps"} - set(changes):
+            arguments.pop(name, None)
     model = cls(env=env, device=device, _init_setup_model=False, **arguments)
     if env is None:
         model.observation_space, model.action_space = state["observation_space"], state["action_space"]

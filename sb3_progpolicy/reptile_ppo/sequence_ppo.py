@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch as th
@@ -21,6 +21,7 @@ from stable_baselines3.common.utils import FloatSchedule, explained_variance, ob
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_progpolicy.finite import check_parameters, check_step, check_update
+from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.normalization import NormalizingExtractor, RewardScaler
 from sb3_progpolicy.policies import DERIVATION_LR_SCALE
 from sb3_progpolicy.reptile_ppo import update
@@ -29,6 +30,8 @@ from sb3_progpolicy.reptile_ppo.rollout import Actor, Batch, SequenceBuffer, min
 from sb3_progpolicy.spaces import action_spec
 
 MAX_DEFAULT_BATCH = 2048
+#: What is taken to follow where a limit of steps cuts an episode short: more of the same, or nothing.
+Timeouts = Literal["bootstrap", "terminal"]
 
 
 def largest_divisor(number: int, limit: int) -> int:
@@ -72,6 +75,7 @@ class SequencePPO(PPO):
     :param action_temperature: of discrete actions' logits, a number or a schedule; ``None`` leaves it at 1
     :param action_std: standard deviation of Box actions, a number or a schedule; ``None`` lets PPO learn it
     :param scale_rewards: divide rewards by the running deviation of the return
+    :param timeouts: ``"bootstrap"`` or ``"terminal"``, see :class:`~sb3_progpolicy.ReptilePPO`
     :param ppo: arguments of ``PPO``
     :raises ValueError: if a value is not accepted
     """
@@ -89,10 +93,14 @@ class SequencePPO(PPO):
         action_temperature: float | Schedule | None,
         action_std: float | Schedule | None,
         scale_rewards: bool,
+        timeouts: Timeouts,
         **ppo: Any,
     ) -> None:
         if length_coef < 0:
             raise ValueError(f"length_coef={length_coef} is not accepted; it is at least 0")
+        if timeouts not in get_args(Timeouts):
+            raise unknown("timeouts", timeouts, get_args(Timeouts))
+        self.timeouts = timeouts
         self.length_coef, self.temperature, self.action_std = length_coef, temperature, action_std
         self.action_temperature = action_temperature
         self.reward_scaler = RewardScaler(ppo["gamma"]) if scale_rewards else None
@@ -171,7 +179,8 @@ class SequencePPO(PPO):
             self._update_info_buffer(infos, dones)
             if self.reward_scaler is not None:
                 rewards = self.reward_scaler(rewards, dones)
-            self._bootstrap_truncated(rewards, dones, infos)
+            if self.timeouts == "bootstrap":
+                self._bootstrap_truncated(rewards, dones, infos)
             rollout_buffer.put(step, self._last_obs, actions, rewards, self._last_episode_starts)  # type: ignore[arg-type]
             self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]
         rollout_buffer.pos, rollout_buffer.full = n_rollout_steps, True

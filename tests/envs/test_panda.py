@@ -132,7 +132,7 @@ def test_docstring_is_complete_and_about_its_own_task(env_id):
 
 @pytest.mark.parametrize("env_id", IDS)
 def test_goal_form_holds_the_flat_numbers_and_computes_the_step_reward(env_id):
-    for reward_type in ("dense", "sparse"):
+    for reward_type in ("dense", "potential", "sparse"):
         flat = make(env_id, 3, reward_type=reward_type)
         goal = make(env_id, 3, observation="goal", reward_type=reward_type)
         flat.reset(seed=4)

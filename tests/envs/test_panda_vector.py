@@ -24,7 +24,7 @@ def flat(observation: Any) -> np.ndarray:
 
 
 @pytest.mark.parametrize("observation", ["flat", "goal"])
-@pytest.mark.parametrize("reward_type", ["dense", "sparse"])
+@pytest.mark.parametrize("reward_type", ["dense", "potential", "sparse"])
 @pytest.mark.parametrize("env_id", IDS)
 def test_batched_equals_single_step_for_step(env_id, reward_type, observation):
     size = DOMAINS[env_id].size

@@ -45,9 +45,11 @@ def test_values_are_put_in_and_the_rest_is_kept() -> None:
 
 
 def extremes(env_id: str) -> list[tuple[str, Any]]:
-    """Return every smallest and largest whole number of a domain, and every choice."""
+    """Return every smallest and largest whole number of a task of a domain, and every choice."""
     values: list[tuple[str, Any]] = []
     for name, parameter in gym.make(env_id).unwrapped.variations.items():
+        if isinstance(parameter, IntParameter) and parameter.of_start:  # not of the task, and bounded by its size
+            continue
         both = (parameter.low, parameter.high) if isinstance(parameter, IntParameter) else parameter.choices
         values += [(name, value) for value in both]
     return values

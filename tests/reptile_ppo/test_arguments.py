@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_progpolicy import InteractionHistory, ReptilePPO, VecInteractionHistory
 from sb3_progpolicy.vec_env import make_fast_vec_env
-from tests.reptile_ppo.models import POLICIES, OneStep, make, weights
+from tests.reptile_ppo.models import POLICIES, Each, OneStep, make, weights
 
 
 @pytest.mark.parametrize("policy", POLICIES)
@@ -64,6 +64,8 @@ def test_tasks_are_given_as_mapping_or_list(tasks):
         ({"tasks": []}, "at least one variation"),
         ({"inner_updates": 0}, "inner_updates=0"),
         ({"meta_optimizer": "lion"}, "known: sgd, adam"),
+        ({"max_episode_steps": 0}, "max_episode_steps=0"),
+        ({"timeouts": "failure"}, "known: bootstrap, terminal"),
         ({"env": "FrozenLake-v1"}, "FlattenObservation"),
         ({"policy_kwargs": {"cell": "mamba"}}, "known cells"),
         ({"env_kwargs": {"n_discs": 99}}, "n_discs=99"),
@@ -74,9 +76,25 @@ def test_values_that_are_not_accepted_are_named(arguments, message):
         make(**arguments)
 
 
+def test_training_episodes_end_at_a_limit_of_their_own():
+    ends = []
+
+    def note(_, local):
+        ends.extend(info["episode"]["l"] for info in local["infos"] if info.get("TimeLimit.truncated"))
+
+    model = make(max_episode_steps=3, tasks=[{"n_discs": 5}]).learn(64, callback=Each(note))
+    assert set(ends) == {3}
+    model.set_env("Hanoi-v0")
+    ends.clear()
+    model.learn(64, callback=Each(note))
+    assert set(ends) == {3}
+
+
 def test_environments_that_are_made_already_take_no_arguments():
-    with pytest.raises(ValueError, match="n_envs and env_kwargs"):
+    with pytest.raises(ValueError, match="n_envs, env_kwargs and max_episode_steps"):
         make(env=gym.make("Hanoi-v0"), n_envs=3)
+    with pytest.raises(ValueError, match="n_envs, env_kwargs and max_episode_steps"):
+        make(env=gym.make("Hanoi-v0"), max_episode_steps=3)
     with pytest.raises(ValueError, match="appends the history itself"):
         make(env=InteractionHistory(gym.make("Hanoi-v0")))
 

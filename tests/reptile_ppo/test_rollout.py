@@ -1,5 +1,6 @@
 """ReptilePPO: states in rollouts, and what is noted for training."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -135,3 +136,58 @@ def test_truncated_episodes_are_bootstrapped_and_ended_ones_are_not(env, bootstr
     model.learn(512, callback=Each(lambda _, local: raw.append(local["rewards"].copy())))
     extra = model.rollout_buffer.rewards.reshape(256, 2) - np.array(raw)
     assert np.flatnonzero(np.abs(extra).sum(1)).tolist() == bootstrapped
+
+
+class Endless(gym.Env):
+    """Nothing happens, and every step is worth 1."""
+
+    observation_space = spaces.Box(-1, 1, (2,), np.float32)
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.ones(2, np.float32), {}
+
+    def step(self, action):
+        return np.ones(2, np.float32), 1.0, False, False, {"is_success": False}
+
+
+@th.no_grad()
+def critic(model, observation):
+    return model._predict_values(th.as_tensor(observation[None], dtype=th.float32), [0]).item()
+
+
+@pytest.mark.parametrize(
+    ("env", "policy"),
+    [
+        (lambda: make_fast_vec_env("Hanoi-v0", 2, n_discs=12, max_episode_steps=5), "ProgPolicy"),
+        (lambda: make_fast_vec_env("Hanoi-v0", 2, n_discs=12, max_episode_steps=5), "MlpPolicy"),
+        (lambda: DummyVecEnv([lambda: gym.wrappers.TimeLimit(Endless(), 5)] * 2), "ProgPolicy"),
+    ],
+)
+def test_after_a_time_limit_nothing_is_earned_where_timeouts_are_terminal(env, policy):
+    gamma, n_steps, limit = 0.5, 16, 5
+    kwargs = {"gamma": gamma, "n_steps": n_steps, "gae_lambda": 1.0, "n_epochs": 1, "tasks": [{}]}
+    kwargs |= {"learning_rate": 0.0, "normalize_observations": False}  # so that the critic stays what it is
+    for timeouts in ("bootstrap", "terminal"):
+        model = make(policy, env(), timeouts=timeouts, **kwargs)
+        rewards, after = [], []
+
+        def record(model, local, rewards=rewards, after=after):
+            rewards.append(local["rewards"].copy())
+            ends = [info.get("terminal_observation") for info in local["infos"]]
+            assert (ends[0] is not None) == (len(rewards) % limit == 0)
+            after.append([0.0 if end is None else critic(model, end) for end in ends])
+
+        model.learn(n_steps * model.n_envs, callback=Each(record))
+        expected, follows = np.zeros((n_steps, 2)), np.array([critic(model, obs) for obs in model._last_obs])
+        for step in reversed(range(n_steps)):
+            if (step + 1) % limit == 0:
+                follows = np.array(after[step]) if timeouts == "bootstrap" else np.zeros(2)
+            expected[step] = follows = rewards[step] + gamma * follows
+        buffer = model.rollout_buffer
+        np.testing.assert_allclose(buffer.returns, expected, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(buffer.advantages, expected - buffer.values, rtol=1e-4, atol=1e-4)
+        ends = np.arange(n_steps) % limit == limit - 1
+        same = np.isclose(buffer.returns[ends], np.array(rewards)[ends])
+        assert same.all() if timeouts == "terminal" else not same.any()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -15,7 +16,7 @@ from progpolicy_envs.panda.sections import SECTIONS
 from progpolicy_envs.panda.tasks import Push, Reach, Slide, Stack, Task
 from progpolicy_envs.planners import panda as controllers
 from progpolicy_envs.single import require_reset
-from progpolicy_envs.variation import IntParameter, VariationSpace
+from progpolicy_envs.variation import IntParameter, VariationSpace, check_n_done, n_done_parameter
 
 __all__ = [
     "PANDA_GYM_PHYSICS",
@@ -42,6 +43,8 @@ class _ObjectsEnv(PandaEnv):
 
     variations: ClassVar[VariationSpace] = VariationSpace(
         IntParameter("n_objects", 1, MAX_OBJECTS, 1, "number of objects"),
+        n_done_parameter(MAX_OBJECTS - 1, "objects that are finished"),
+        check=partial(check_n_done, size="n_objects"),
         starts={"starts": "x and y of each object, metres", "targets": "x and y of each target, metres"},
     )
 
@@ -53,8 +56,9 @@ class _ObjectsEnv(PandaEnv):
         render_mode: str | None = None,
         physics: Physics | None = None,
         context: str = "hidden",
+        n_done: int | str = 0,
     ) -> None:
-        variation = {"n_objects": n_objects}
+        variation = {"n_objects": n_objects, "n_done": n_done}
         super().__init__(variation, reward_type=reward_type, render_mode=render_mode, physics=physics, context=context)
 
 
@@ -81,12 +85,18 @@ class PandaReachEnv(PandaEnv):
     * 10 per metre by which the object in focus came closer to its target,
     $rewards
 
+    ``reward_type="potential"``: $gains
+
+    * -10 per metre of the gripper's way through the targets that are left, in order,
+    * 1 for every target that has been visited.
+
     ``reward_type="sparse"``: 0 where the object in focus is at its target, -1 otherwise.
 
     ## Starting State
     The arm in its neutral pose, the gripper near (0.04, 0, 0.2), fingers closed. Targets by seed in a box of 33 x
     50 x 30 cm, at least 10 cm apart and from the gripper. ``env.reset(options={"targets": [[0.1, 0.2, 0.3]]})`` gives
-    them instead, in metres; ``env.unwrapped.start`` is what the present episode started with, in this form.
+    them instead, in metres; ``env.unwrapped.start`` is what the present episode started with, in this form. With
+    ``n_done`` above 0 the first targets have been visited, and the gripper is at the last of these.
 
     ## Episode End
     Terminated when the last target is visited; truncated after 500 steps (``max_episode_steps``).
@@ -97,6 +107,8 @@ class PandaReachEnv(PandaEnv):
     task_class: ClassVar[type[Task]] = Reach
     variations: ClassVar[VariationSpace] = VariationSpace(
         IntParameter("n_targets", 1, MAX_OBJECTS, 1, "number of targets"),
+        n_done_parameter(MAX_OBJECTS - 1, "targets that have been visited"),
+        check=partial(check_n_done, size="n_targets"),
         starts={"targets": "x, y and z of each target, metres"},
     )
     controller: ClassVar[Callable[[FlatObservation], Action]] = staticmethod(controllers.reach)
@@ -109,8 +121,9 @@ class PandaReachEnv(PandaEnv):
         render_mode: str | None = None,
         physics: Physics | None = None,
         context: str = "hidden",
+        n_done: int | str = 0,
     ) -> None:
-        variation = {"n_targets": n_targets}
+        variation = {"n_targets": n_targets, "n_done": n_done}
         super().__init__(variation, reward_type=reward_type, render_mode=render_mode, physics=physics, context=context)
 
 
@@ -141,18 +154,31 @@ class PandaPushEnv(_ObjectsEnv):
     * 5 per metre by which the gripper came closer to the point 5 cm behind the object, seen from its target,
     $rewards
 
+    ``reward_type="potential"``: $gains
+
+    $left
+    * -5 per metre of the gripper's way to where it pushes the block in focus from: 3 to 5 cm behind its centre, seen
+      from the target, at its height. The way is the horizontal distance from there, plus half of the height above the
+      centre, plus 1.5 times the height that the gripper lacks: it should be 0.8 times as high above the centre as it is
+      away, up to 8 cm, and 5 cm over the block itself. So the way leads through the air, down behind the block, and
+      no place on top of the block or around it is at rest,
+    $leaving
+
+    $reach
+
     ``reward_type="sparse"``: 0 where the object in focus is at its target, -1 otherwise.
 
     ## Starting State
     The arm in its neutral pose, fingers closed. Blocks and targets by seed, in reach, at least 9 cm apart from
     their like, 10 to 35 cm from block to target; taken in colour order every straight way, with a run-up of 8 cm,
-    is 8 cm clear of the other blocks.
+    is 8 cm clear of the other blocks. With ``n_done`` above 0 the first blocks lie on their targets, and the gripper is
+    5 cm behind the last of these, at its height, on the straight way that it has come.
 
     $start
 
     ## Episode End
-    Terminated when every object is finished, or as a failure when one leaves the table; truncated after 500 steps
-    (``max_episode_steps``).
+    Terminated when every object is finished, or as a failure when one leaves the table or, with
+    ``reward_type="potential"``, is out of reach; truncated after 500 steps (``max_episode_steps``).
 
     $rules
     """
@@ -191,18 +217,31 @@ class PandaSlideEnv(_ObjectsEnv):
     * 5 per metre by which the gripper came closer to the point 6 cm behind the object, seen from its target,
     $rewards
 
+    ``reward_type="potential"``: $gains
+
+    $left
+    * -5 per metre of the gripper's way to where it pushes the puck in focus from: 4 to 6 cm behind its centre, seen
+      from the target, at its height. The way is the horizontal distance from there, plus half of the height above the
+      centre, plus 1.5 times the height that the gripper lacks: it should be 0.8 times as high above the centre as it is
+      away, up to 8 cm, and 5 cm over the puck itself; 0.6 m more for every other puck that is left,
+    * 1 for every delivered puck.
+
+    With it, a puck that lies still beyond 80 cm from the axis on which the arm turns, not delivered, ends the episode
+    as a failure; most targets are beyond.
+
     ``reward_type="sparse"``: 0 where the object in focus is at its target, -1 otherwise.
 
     ## Starting State
     The arm in its neutral pose, fingers closed. Pucks by seed in the near half of the table, the front ones first
     in colour order; targets at x from 0.3 to 0.54, at most 22 degrees off the x axis as seen from their pucks;
-    taken in colour order every straight way is 8 cm clear of the other pucks.
+    taken in colour order every straight way is 8 cm clear of the other pucks. With ``n_done`` above 0 the first pucks
+    have been delivered; the arm is in its neutral pose.
 
     $start
 
     ## Episode End
-    Terminated when every object is finished, or as a failure when one leaves the table; truncated after 500 steps
-    (``max_episode_steps``).
+    Terminated when every object is finished, or as a failure when one leaves the table or, with
+    ``reward_type="potential"``, is out of reach; truncated after 500 steps (``max_episode_steps``).
 
     $rules
     """
@@ -240,18 +279,29 @@ class PandaStackEnv(_ObjectsEnv):
     * 5 per metre by which the gripper came closer to the object,
     $rewards
 
+    ``reward_type="potential"``: $gains
+
+    $left
+    * -5 per metre of the gripper's way to the block in focus: the horizontal distance, plus half of the height above
+      it, plus 1.5 times the height that the gripper lacks, which should be twice as high above the block as it is away,
+      up to 8 cm; and while it is above the block, what the fingers lack to be open, 8 cm,
+    $leaving
+
+    $reach
+
     ``reward_type="sparse"``: 0 where the object in focus is at its target, at rest and free of the gripper,
     -1 otherwise.
 
     ## Starting State
     The arm in its neutral pose, fingers closed. The tower's place by seed, x from -0.02 to 0.08, y from -0.12 to
-    0.12; blocks by seed where the gripper can pick them up without touching the tower or another block.
+    0.12; blocks by seed where the gripper can pick them up without touching the tower or another block. With ``n_done``
+    above 0 the first blocks have been stacked, and the open gripper is 6 cm above the last of these.
 
     $start In a tower all targets have the same x and y.
 
     ## Episode End
-    Terminated when every object is finished, or as a failure when one leaves the table; truncated after 500 steps
-    (``max_episode_steps``).
+    Terminated when every object is finished, or as a failure when one leaves the table or, with
+    ``reward_type="potential"``, is out of reach; truncated after 500 steps (``max_episode_steps``).
 
     $rules
     """
@@ -262,6 +312,8 @@ class PandaStackEnv(_ObjectsEnv):
     def begin_tower(self, n_done: int) -> Observation:
         """Begin the episode once more with the first blocks in their places, as if they had been stacked.
 
+        Unlike ``n_done`` it leaves the arm in its neutral pose, whose gripper is just above a tower of four.
+
         :param n_done: how many, fewer than there are
         :return: the observation
         :raises ValueError: if there are not so many blocks
@@ -270,12 +322,7 @@ class PandaStackEnv(_ObjectsEnv):
         n_objects = len(self.task.targets)
         if not 0 <= n_done < n_objects:
             raise ValueError(f"n_done={n_done} is not accepted; of {n_objects} blocks 0 to {n_objects - 1} can be done")
-        starts, targets = np.array(self.task.starts), np.array(self.task.targets)
-        starts[:n_done] = targets[:n_done]
-        self.task.place(self.scene, starts, targets)
-        self.task.update(self.scene)
-        self._update_focus()
-        return self._observation()
+        return self._place(np.array(self.task.starts), np.array(self.task.targets), n_done, neutral=True)
 
 
 class PandaReachGoalEnv(PandaGoalEnv, PandaReachEnv):

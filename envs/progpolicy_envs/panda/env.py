@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from progpolicy_envs.panda.camera import Camera
 from progpolicy_envs.panda.focus import ACTION_NAMES, BOUND, OBSERVATION_NAMES, focus_observation
 from progpolicy_envs.panda.physics import CONTROL_STEP, ObjectState, Physics
+from progpolicy_envs.panda.placement import Points
 from progpolicy_envs.panda.scene import Scene
 from progpolicy_envs.panda.tasks import Task
 from progpolicy_envs.rendering import Frame
 from progpolicy_envs.single import DomainEnv, require_reset
 from progpolicy_envs.symmetry import Permutation, Symmetry
-from progpolicy_envs.variation import Variation, VariationSpace
+from progpolicy_envs.variation import Variation, VariationSpace, draw_n_done
 
 FlatObservation = NDArray[np.float32]
 Observation = FlatObservation | dict[str, NDArray[np.float32]]
@@ -40,6 +41,8 @@ MIRROR = Symmetry(
     Permutation.flips(ACTION_NAMES, ("move_y",)),
 )
 
+REWARD_TYPES = ("dense", "potential", "sparse")
+
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 _STILL = (0.0, 0.0, 0.0)
 
@@ -59,7 +62,8 @@ def check_choice(name: str, value: Any, choices: Sequence[Any]) -> None:
 class PandaEnv(DomainEnv):
     """What the Panda environments have in common; see :class:`~progpolicy_envs.panda.PandaPushEnv` and the others.
 
-    A subclass names its :attr:`task_class`, its one variation parameter and its :attr:`controller`.
+    A subclass names its :attr:`task_class`, its variation parameters, the number of objects first, and its
+    :attr:`controller`.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": round(1 / CONTROL_STEP)}
@@ -80,7 +84,7 @@ class PandaEnv(DomainEnv):
         physics: Physics | None = None,
         context: str = "hidden",
     ) -> None:
-        check_choice("reward_type", reward_type, ("dense", "sparse"))
+        check_choice("reward_type", reward_type, REWARD_TYPES)
         check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         super().__init__(variation, self._observed_space(), render_mode, context)
         self.reward_type = reward_type
@@ -88,7 +92,7 @@ class PandaEnv(DomainEnv):
         self.task = self.task_class()
         self.scene = Scene(self.task.table, self.task.kind, physics, visual=render_mode is not None)
         self._camera = Camera(self.scene, self.task) if render_mode is not None else None
-        self._approach_distance = 0.0
+        self._approach_distance = self._potential = 0.0
 
     def _observed_space(self) -> spaces.Space[Any]:
         """Return the space of observations, without the variation's numbers."""
@@ -117,20 +121,14 @@ class PandaEnv(DomainEnv):
 
         :return: observation, reward, info
         """
-        task, index, achieved, n_left = self.task, self._focus, self._achieved, self._n_left
-        before = self._approach_distance
+        task, index, achieved = self.task, self._focus, self._achieved
         self.scene.sync_state()
         task.update(self.scene)
-        failure = task.failed
-        self._approach_distance = self._distance_to_approach_point(index)
-        shaping = STEP + APPROACH * (before - self._approach_distance) + FAILURE * failure
-        self._update_focus(index)
-        shaping += FINISHED * (n_left - self._n_left)
+        by_potential = self.reward_type == "potential"
+        failure = task.failed or (by_potential and task.out_of_reach)
+        shaping = self._potential_shaping(failure) if by_potential else self._dense_shaping(failure)
         if self._focus != index:
-            # The new object has made no progress yet; that of the old one goes into the shaping.
-            target = task.targets[index]
-            shaping += PROGRESS * (math.dist(achieved, target) - math.dist(task.positions[index], target))
-            achieved = self._achieved
+            achieved = self._achieved  # the new object has made no progress yet
         info = {
             "is_success": self._n_left == 0,
             "is_failure": failure,
@@ -140,6 +138,33 @@ class PandaEnv(DomainEnv):
         }
         observation = self._observation()
         return observation, self._reward(observation, info), info
+
+    def _dense_shaping(self, failure: bool) -> float:
+        """Return what the dense reward has besides the progress of the object in focus, and find the new focus."""
+        index, achieved, n_left, before = self._focus, self._achieved, self._n_left, self._approach_distance
+        self._approach_distance = self._distance_to_approach_point(index)
+        shaping = STEP + APPROACH * (before - self._approach_distance) + FAILURE * failure
+        self._update_focus(index)
+        shaping += FINISHED * (n_left - self._n_left)
+        if self._focus != index:
+            # That of the old one, which is not in focus any more.
+            target = self.task.targets[index]
+            shaping += PROGRESS * (math.dist(achieved, target) - math.dist(self.task.positions[index], target))
+        return shaping
+
+    def _potential_shaping(self, failure: bool) -> float:
+        """Return the reward by potential less the progress of the object in focus, and find the new focus."""
+        index, achieved, before = self._focus, self._achieved, self._potential
+        self._update_focus(index)
+        shaping = STEP + self._potential - before + FAILURE * failure
+        if self._focus == index:
+            shaping -= PROGRESS * (math.dist(achieved, self._desired) - math.dist(self._achieved, self._desired))
+        return shaping
+
+    def potential(self) -> float:
+        """Return the potential of the present state, whose gains are the reward of ``reward_type="potential"``."""
+        require_reset(self._started, "potential()")
+        return self._find_potential()
 
     def plan(self) -> Iterator[Action]:
         """Return an iterator of the scripted controller's actions, each for the state in which the environment then is.
@@ -157,7 +182,7 @@ class PandaEnv(DomainEnv):
         require_reset(self._started, "start")
         start = {"starts": self.task.starts, "targets": self.task.targets}
         places = {name: [list(place) for place in start[name]] for name in self.variations.starts}
-        return {next(iter(self.variations)): len(self.task.targets), **places}
+        return {self._size: len(self.task.targets), "n_done": self.task.n_done, **places}
 
     def replace_start(self, start: Mapping[str, Any]) -> Observation:
         """Begin the episode once more with other starts or targets.
@@ -168,9 +193,8 @@ class PandaEnv(DomainEnv):
         """
         task = self.task
         given = {"starts": task.starts, "targets": task.targets, **start}
-        task.place(self.scene, *task.read_start(len(task.targets), given["starts"], given["targets"]))
-        self._update_focus()
-        return self._observation()
+        read = task.read_start(len(task.targets), given["starts"], given["targets"], task.n_done)
+        return self._place(*read, task.n_done)
 
     def render(self) -> Any:
         """Return a picture ``(360, 480, 3)`` of bytes, or show a window, as ``render_mode`` says."""
@@ -190,11 +214,21 @@ class PandaEnv(DomainEnv):
             yield type(self).controller(self._flat_observation())
 
     def _start(self, variation: Variation, start: Mapping[str, Any]) -> None:
-        (size,) = variation.values()
-        self.task.place(self.scene, *self.task.sample(self.np_random, size))
-        self._update_focus()
+        starts, targets = self.task.sample(self.np_random, variation[self._size])
+        self._place(starts, targets, draw_n_done(variation, self._size, self.np_random))
         if start:
             self.replace_start(start)
+
+    def _place(self, starts: Points, targets: Points, n_done: int, neutral: bool = False) -> Observation:
+        """Begin an episode; see :meth:`Task.place`. Return its observation."""
+        self.task.place(self.scene, starts, targets, n_done, neutral)
+        self._update_focus()
+        return self._observation()
+
+    @property
+    def _size(self) -> str:
+        """Name of the parameter that says how many objects there are."""
+        return next(iter(self.variations))
 
     def _reward(self, observation: Any, info: Mapping[str, Any]) -> float:
         """Return the reward of the present step."""
@@ -214,6 +248,13 @@ class PandaEnv(DomainEnv):
         self._desired = self.task.targets[self._focus]
         if self._focus != before:
             self._approach_distance = self._distance_to_approach_point(self._focus)
+        if self.reward_type == "potential":
+            self._potential = self._find_potential()
+
+    def _find_potential(self) -> float:
+        task = self.task
+        left = PROGRESS * task.distance_left() + APPROACH * task.way_left(self.scene)
+        return FINISHED * task.finished.count(True) - left
 
     def _distance_to_approach_point(self, index: int) -> float:
         point = self.task.approach_point(index)

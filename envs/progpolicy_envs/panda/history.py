@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from progpolicy_envs.panda.physics import Point
+from progpolicy_envs.panda.physics import Hand, Point
 
 if TYPE_CHECKING:
     from progpolicy_envs.panda.scene import Scene
@@ -23,12 +23,14 @@ class History:
     """What has been done in a scene since objects were placed.
 
     :param placed: the positions at which they were placed
+    :param hand: where the gripper was, ``None`` in the neutral pose
     :param actions: four numbers for each control step, NaN where no action was given
     :param parked: for each object taken off the table, the number of control steps before, and which object
     :param pending: the action of the next control step, if it has been given
     """
 
     placed: tuple[Point, ...]
+    hand: Hand | None = None
     actions: array[float] = field(default_factory=lambda: array("d"))
     parked: list[tuple[int, int]] = field(default_factory=list)
     pending: Sequence[float] = _NO_ACTION
@@ -44,7 +46,7 @@ class History:
 
     def repeat(self, scene: Scene) -> None:
         """Do all of it again in another scene."""
-        scene.place(self.placed)
+        scene.place(self.placed, self.hand)
         steps, parked = np.reshape(self.actions, (-1, len(_NO_ACTION))).tolist(), list(self.parked)
         for number, action in enumerate([*steps, self.pending]):
             while parked and parked[0][0] == number:

@@ -66,6 +66,18 @@ PANDA_GYM_PHYSICS = Physics(
 
 
 @dataclass(frozen=True)
+class Hand:
+    """Where an episode finds the gripper that does not begin in the neutral pose.
+
+    :param position: of the point between the fingertips, metres
+    :param width: between the fingers, metres
+    """
+
+    position: Point
+    width: float = 0.0
+
+
+@dataclass(frozen=True)
 class Table:
     """A table whose top is at height 0, symmetric about y = 0.
 

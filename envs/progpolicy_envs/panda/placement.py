@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progpolicy_envs.panda.physics import ObjectKind, Table
-from progpolicy_envs.panda.robot import BASE_POSITION
+from progpolicy_envs.panda.robot import BASE_POSITION, FARTHEST, NEAREST
 
 Points = NDArray[np.float64]
 #: Two or three coordinates, metres.
@@ -115,6 +115,11 @@ def extended(start: Place, target: Place, back: float) -> Place:
 def reachable(place: Place, least: float = 0.26, most: float = 0.74) -> bool:
     """Return whether the gripper, pointing down, can work at this point of the table."""
     return least <= math.hypot(place[0] - BASE_POSITION[0], place[1] - BASE_POSITION[1]) <= most
+
+
+def in_reach(place: Place) -> bool:
+    """Return whether the gripper, pointing down, can come to this point of the table at all."""
+    return NEAREST <= math.hypot(place[0] - BASE_POSITION[0], place[1] - BASE_POSITION[1]) <= FARTHEST
 
 
 def all_apart(places: Points, others: Points, distance: float) -> NDArray[np.bool_]:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 from progpolicy_envs.panda.libraries import pybullet
+from progpolicy_envs.panda.physics import Hand
 
 BASE_POSITION = (-0.6, 0.0, 0.0)
 #: Largest displacement of the gripper that one action asks for, metres.
@@ -33,8 +34,10 @@ _SHOULDER, _UPPER_ARM, _FOREARM, _ELBOW, _WRIST, _HAND = 0.333, 0.316, 0.384, 0.
 _TO_ELBOW, _TO_WRIST = math.hypot(_UPPER_ARM, _ELBOW), math.hypot(_FOREARM, _ELBOW)
 _ELBOW_ANGLES = math.atan2(_ELBOW, _UPPER_ARM), math.atan2(_ELBOW, _FOREARM)
 _BENT = sum(_ELBOW_ANGLES)
-# The gripper stays this far from the axis on which the arm turns: nearer, a small displacement is a large turn.
-_NEAREST = 0.2
+#: The gripper stays this far from the axis on which the arm turns: nearer, a small displacement is a large turn.
+NEAREST = 0.2
+#: On the table the gripper comes this far from that axis.
+FARTHEST = 0.8
 
 
 def motor_gain(time_step: float) -> float:
@@ -62,7 +65,7 @@ def arm_angles(x: float, y: float, z: float) -> list[float]:
     """
     x, y = x - BASE_POSITION[0], y - BASE_POSITION[1]
     turn = math.atan2(y, x)
-    out, up = max(_NEAREST, math.hypot(x, y)) - _WRIST, z + _HAND - _SHOULDER
+    out, up = max(NEAREST, math.hypot(x, y)) - _WRIST, z + _HAND - _SHOULDER
     span = math.hypot(out, up)
     at_elbow = _corner(_TO_ELBOW, _TO_WRIST, span)
     at_shoulder = _corner(_TO_ELBOW, span, _TO_WRIST)
@@ -134,11 +137,15 @@ class PandaRobot:
         )
         pybullet.changeConstraint(gear, gearRatio=-1, erp=0.1, maxForce=100, physicsClientId=self.client)
 
-    def place(self) -> None:
-        """Put all joints into the neutral pose, at rest, fingers closed."""
-        for joint, angle in zip(_JOINTS, _NEUTRAL, strict=True):
+    def place(self, hand: Hand | None = None) -> None:
+        """Put all joints into a pose, at rest.
+
+        :param hand: where the gripper is; by default the pose is the neutral one, fingers closed
+        """
+        pose = _NEUTRAL if hand is None else (*arm_angles(*hand.position), hand.width / 2, hand.width / 2)
+        for joint, angle in zip(_JOINTS, pose, strict=True):
             pybullet.resetJointState(self.body, joint, angle, 0.0, physicsClientId=self.client)
-        self._drive(_NEUTRAL)
+        self._drive(pose)
 
     def read(self) -> None:
         """Read the gripper's position, velocity and width from the simulation, in two calls of PyBullet."""

@@ -12,6 +12,7 @@ from progpolicy_envs.panda.libraries import pybullet, pybullet_data
 from progpolicy_envs.panda.physics import (
     BULLET_MARGIN,
     MAX_OBJECTS,
+    Hand,
     ObjectKind,
     ObjectState,
     Physics,
@@ -162,14 +163,15 @@ class Scene:
         """Height of the centre of an object that lies on the table, metres."""
         return self.kind.height if self.kind else 0.0
 
-    def place(self, positions: Sequence[Point]) -> None:
-        """Put the robot into its neutral pose and objects onto the table, all at rest, as in a new world.
+    def place(self, positions: Sequence[Point], hand: Hand | None = None) -> None:
+        """Put the robot into a pose and objects onto the table, all at rest, as in a new world.
 
         Objects that lie on the table start asleep.
 
         :param positions: the centres of the objects, metres, no two overlapping
+        :param hand: where the gripper is; by default the pose is the neutral one
         """
-        self._history = History(tuple(positions))
+        self._history = History(tuple(positions), hand)
         self._set_delicate(False)
         for index, body in enumerate(self.objects):
             self._move(body, _parking(index))
@@ -182,7 +184,7 @@ class Scene:
                 self._activate(body, state)
             pybullet.stepSimulation(physicsClientId=self.client)
         self._set_delicate(False)
-        self.robot.place()
+        self.robot.place(hand)
         self.n_objects = len(positions)
         self._used = self.objects[: self.n_objects]
         self._still_steps = [0] * MAX_OBJECTS

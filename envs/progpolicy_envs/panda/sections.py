@@ -46,9 +46,28 @@ SECTIONS = {
 
         Progress is measured as a difference, so that nothing is gained by moving to and fro.
         """,
+    "gains": """
+        -0.01 for the step, -5 for a failure, and what is gained in a potential, so that no way back and forth pays: an
+        episode pays the difference between its last and its first state. ``env.unwrapped.potential()`` returns it, the
+        sum of
+        """,
+    "left": """
+        * -10 per metre from every object to its target, finished or not: to move any of them away costs at once,
+        """,
+    "leaving": """
+        * where that way is longer than 5 to 15 cm and the gripper is near a finished block, nearer than 6 to 12 cm and
+          less than 2 to 6 cm above it, the way counts 0.6 m instead, as far as both are so: leaving is paid first,
+        * 0.6 m of way more for every other block that is left, so that to finish one costs nothing,
+        * 1 for every finished block.
+        """,
+    "reach": """
+        With it, an unfinished block nearer than 20 cm to the axis on which the arm turns, or farther than 80 cm, ends
+        the episode as a failure.
+        """,
     "start": """
         ``env.reset(options={"n_objects": 1, "starts": [[-0.1, 0.1]], "targets": [[0.0, -0.1]]})`` gives them instead,
-        as x and y in metres; whether the task can then be solved is not checked. ``env.unwrapped.start`` is what the
+        as x and y in metres; whether the task can then be solved is not checked. Starts
+        of what ``n_done`` has finished are not used. ``env.unwrapped.start`` is what the
         present episode started with, in this form.
         """,
     "rules": """
@@ -65,14 +84,19 @@ SECTIONS = {
         | Parameter   | Values              | Default   | Meaning                                                   |
         |-------------|---------------------|-----------|-----------------------------------------------------------|
         | $size   | 1 to 8              | 1         | number of $things                                         |
+        | n_done      | 0 to 7, "random"    | 0         | $things finished at the start, fewer than there are;      |
+        |             |                     |           | "random" draws a number for every episode                 |
         | observation | "flat", "goal"      | "flat"    | one array, or the dictionary of a goal environment        |
-        | reward_type | "dense", "sparse"   | "dense"   | see above                                                 |
+        | reward_type | "dense", "sparse",  | "dense"   | see above                                                 |
+        |             | "potential"         |           |                                                           |
         | physics     | ``Physics``, None   | None      | time step and solver; None is 120 Hz, 4 steps an action   |
 
         ## References
         panda-gym (Gallouédec, Cazin, Dellandréa and Chen, 2021), whose robot, table and control these are.
+        Ng, Harada and Russell, Policy invariance under reward transformations, ICML 1999: rewards by potential, here
+        without discount.
 
         ## Version History
-        * v0: initial version
+        * v0: initial version; ``reward_type="potential"`` came later and changes nothing of the others
         """,
 }

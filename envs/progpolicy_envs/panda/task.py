@@ -9,8 +9,9 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from progpolicy_envs.panda.physics import ObjectKind, Point, Table
-from progpolicy_envs.panda.placement import Points, check_apart, check_on_table, read_points
+from progpolicy_envs.panda.physics import Hand, ObjectKind, Point, Table
+from progpolicy_envs.panda.placement import Points, check_apart, check_on_table, in_reach, read_points
+from progpolicy_envs.panda.potential import FULL_WAY, way_after
 from progpolicy_envs.panda.scene import FALL_DEPTH, Scene
 
 
@@ -51,26 +52,38 @@ class Task(ABC):
         self.positions: list[Point] = []
         self.targets: list[Point] = []
         self.finished: list[bool] = []
+        #: How many objects were finished when the episode began.
+        self.n_done = 0
 
-    def place(self, scene: Scene, starts: Points, targets: Points) -> None:
+    def place(self, scene: Scene, starts: Points, targets: Points, n_done: int = 0, neutral: bool = False) -> None:
         """Begin an episode: put the robot and the objects into the world.
 
         :param scene: the world
         :param starts: centres of the objects, metres, ``(n, 3)``; ``(0, 3)`` for Reach
         :param targets: ``(n, 3)``
+        :param n_done: how many objects are finished: the first ones are at their targets, not at their starts
+        :param neutral: whether the gripper is in its neutral pose even so, and not where it finished the last of them
         """
         self.starts = [tuple(start) for start in starts.tolist()]
         self.targets = [tuple(target) for target in targets.tolist()]
-        self.finished = [False] * len(self.targets)
-        scene.place(self.starts)
+        self.finished = [index < n_done for index in range(len(self.targets))]
+        self.n_done = n_done
+        self.positions = [*self.targets[:n_done], *self.starts[n_done:]]
+        hand = None if neutral or not n_done else self.hand_after(n_done - 1)
+        scene.place(self.positions if self.kind else [], hand)
         self.positions = self._positions(scene)
 
-    def read_start(self, n_objects: int, starts: Any, targets: Any) -> tuple[Points, Points]:
+    def hand_after(self, index: int) -> Hand | None:
+        """Return where the gripper is that has just finished an object; ``None`` for the neutral pose."""
+        return None
+
+    def read_start(self, n_objects: int, starts: Any, targets: Any, n_done: int = 0) -> tuple[Points, Points]:
         """Return starts and targets that a user gives, ``(n, 3)`` each, as :meth:`place` takes them.
 
         :param n_objects: how many objects
         :param starts: x and y of each object's centre, metres; z too, if it is that of an object on the table
         :param targets: in the same form
+        :param n_done: how many objects are finished, so that their starts do not matter
         :raises ValueError: if they are not of that form, or if objects would touch each other or the robot
         """
         assert self.kind is not None
@@ -78,8 +91,17 @@ class Task(ABC):
         targets = read_points("targets", targets, self.target_heights(n_objects))
         for name, points in (("starts", starts), ("targets", targets)):
             check_on_table(name, points, self.table)
-        check_apart("starts", starts, self.kind)
+        finished = self.lying(targets[:n_done])
+        name = "starts" if not n_done else f"{len(finished)} finished and {n_objects - n_done} others"
+        check_apart(name, np.concatenate([finished, starts[n_done:]]), self.kind)
         return starts, targets
+
+    def lying(self, finished: Points) -> Points:
+        """Return the places on the table that finished objects take up.
+
+        :param finished: their targets, ``(n_done, 3)``
+        """
+        return finished
 
     def target_heights(self, n_objects: int) -> Points:
         """Return the heights of the targets, metres, ``(n,)``."""
@@ -104,6 +126,30 @@ class Task(ABC):
                 return True
         return False
 
+    @property
+    def out_of_reach(self) -> bool:
+        """Whether an unfinished object is where the arm cannot work at it, so that the task cannot be done any more."""
+        return any(
+            not finished and not in_reach(position)
+            for finished, position in zip(self.finished, self.positions, strict=True)
+        )
+
+    def distance_left(self) -> float:
+        """Return how far all objects are from their targets in all, finished ones too, metres."""
+        return sum(map(math.dist, self.positions, self.targets))
+
+    def way_left(self, scene: Scene) -> float:
+        """Return the length of the gripper's ways to the objects that are unfinished, metres, 0 when there are none.
+
+        The first of them is that to the object in focus, in which leaving a finished object comes first; each of the
+        others counts :data:`~progpolicy_envs.panda.potential.FULL_WAY`.
+        """
+        if False not in self.finished:
+            return 0.0
+        finished = [place for place, done in zip(self.positions, self.finished, strict=True) if done]
+        way = way_after(self.approach(scene, self.focus), scene.robot.position, finished)
+        return way + FULL_WAY * (self.finished.count(False) - 1)
+
     def settled(self, scene: Scene, index: int) -> bool:
         """Return whether an object would be finished if it were at its target: whether all other conditions hold."""
         return True
@@ -111,6 +157,10 @@ class Task(ABC):
     @abstractmethod
     def sample(self, rng: np.random.Generator, n_objects: int) -> tuple[Points, Points]:
         """Return starts (``(n, 3)``; ``(0, 3)`` for Reach) and targets ``(n, 3)``."""
+
+    @abstractmethod
+    def approach(self, scene: Scene, index: int) -> float:
+        """Return the length of the gripper's way to where it moves an object from, metres."""
 
     @abstractmethod
     def approach_point(self, index: int) -> Point | None:

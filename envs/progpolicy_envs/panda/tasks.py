@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from progpolicy_envs.panda.physics import ObjectKind, Point, Table
+from progpolicy_envs.panda.physics import Hand, ObjectKind, Point, Table
 from progpolicy_envs.panda.placement import (
     Place,
     Points,
@@ -20,13 +20,22 @@ from progpolicy_envs.panda.placement import (
     corridor_distance,
     corridor_distances,
     extended,
+    in_reach,
     reachable,
     read_points,
     sample_in_order,
 )
-from progpolicy_envs.panda.robot import BASE_POSITION
+from progpolicy_envs.panda.potential import way_behind, way_onto
+from progpolicy_envs.panda.robot import BASE_POSITION, MAX_WIDTH
 from progpolicy_envs.panda.scene import Scene
 from progpolicy_envs.panda.task import DISC, Mark, Task
+
+#: How far behind a block and a puck the gripper has to be to push it, metres, and how much nearer it is in contact.
+BEHIND_BLOCK, BEHIND_PUCK, GAP = 0.05, 0.06, 0.02
+#: How high above a block that has been stacked the gripper rises, metres.
+RISEN = 0.06
+#: An object that moves less than this in one control step is at rest, metres.
+REST_MOTION = 0.001
 
 
 class Reach(Task):
@@ -52,12 +61,37 @@ class Reach(Task):
         """Return ``None``: the gripper itself is what moves."""
         return None
 
-    def read_start(self, n_objects: int, starts: Any, targets: Any) -> tuple[Points, Points]:
+    def hand_after(self, index: int) -> Hand:
+        """Return the target itself."""
+        return Hand(self.targets[index])
+
+    @property
+    def out_of_reach(self) -> bool:
+        """``False``: there are no objects."""
+        return False
+
+    def distance_left(self) -> float:
+        """Return the length of the gripper's way through the targets that are left, metres."""
+        if False not in self.finished:
+            return 0.0
+        left = [self.positions[0], *self.targets[self.focus :]]
+        return sum(map(math.dist, left, left[1:]))
+
+    def way_left(self, scene: Scene) -> float:
+        """Return 0: the gripper itself is what moves."""
+        return 0.0
+
+    def approach(self, scene: Scene, index: int) -> float:
+        """Return 0: the gripper itself is what moves."""
+        return 0.0
+
+    def read_start(self, n_objects: int, starts: Any, targets: Any, n_done: int = 0) -> tuple[Points, Points]:
         """Return no starts, and targets that a user gives.
 
         :param n_objects: how many targets
         :param starts: not used
         :param targets: x, y and z of each target, metres
+        :param n_done: not used
         :raises ValueError: if they are not of that form, or below the table's top
         """
         points = read_points("targets", targets, np.full(n_objects, np.nan))
@@ -135,9 +169,18 @@ class Push(Task):
 
         return _on_table(*sample_in_order(n_objects, propose, fits, screen), height=self.kind.height)
 
+    def hand_after(self, index: int) -> Hand:
+        """Return the place behind the block on the straight way that it has come."""
+        return Hand(_beyond(self.targets[index], self.starts[index], BEHIND_BLOCK))
+
     def approach_point(self, index: int) -> Point:
         """Return the point behind the block on the line to its target."""
-        return _behind(self.positions[index], self.targets[index], 0.05)
+        return _behind(self.positions[index], self.targets[index], BEHIND_BLOCK)
+
+    def approach(self, scene: Scene, index: int) -> float:
+        """Return the way behind the block."""
+        places = self.positions[index], self.targets[index]
+        return way_behind(scene.robot.position, *places, BEHIND_BLOCK, BEHIND_BLOCK - GAP)
 
 
 class Slide(Task):
@@ -152,6 +195,10 @@ class Slide(Task):
     separation = (0.14, 0.1)
     #: Tangent of the largest angle between the x axis and the way to the target.
     slope = 0.4
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._before: list[Point] = []
 
     def sample(self, rng: np.random.Generator, n_objects: int) -> tuple[Points, Points]:
         """Return pucks near the robot and targets out of its reach, the ways in colour order free."""
@@ -196,9 +243,19 @@ class Slide(Task):
             corridor_distance(run_up, target, other) > self.clearance for other in later
         )
 
+    def place(self, scene: Scene, starts: Points, targets: Points, n_done: int = 0, neutral: bool = False) -> None:
+        """Begin an episode; the pucks that are delivered already are off the table. See :meth:`Task.place`."""
+        super().place(scene, starts, targets, n_done, neutral)
+        for index in range(n_done):
+            scene.park(index)
+
+    def lying(self, finished: Points) -> Points:
+        """Return no places: delivered pucks are off the table."""
+        return finished[:0]
+
     def update(self, scene: Scene) -> None:
         """Read the state of the world and take delivered pucks off the table."""
-        before = self.finished
+        before, self._before = self.finished, self.positions
         super().update(scene)
         if self.finished != before:
             for index, (old, new) in enumerate(zip(before, self.finished, strict=True)):
@@ -207,7 +264,21 @@ class Slide(Task):
 
     def approach_point(self, index: int) -> Point:
         """Return the point behind the puck on the line to its target."""
-        return _behind(self.positions[index], self.targets[index], 0.06)
+        return _behind(self.positions[index], self.targets[index], BEHIND_PUCK)
+
+    def approach(self, scene: Scene, index: int) -> float:
+        """Return the way behind the puck."""
+        return way_behind(
+            scene.robot.position, self.positions[index], self.targets[index], BEHIND_PUCK, BEHIND_PUCK - GAP
+        )
+
+    @property
+    def out_of_reach(self) -> bool:
+        """Whether a puck lies still, neither delivered nor where the arm can work at it: most targets are beyond."""
+        return any(
+            not finished and not in_reach(position) and math.dist(position, before) < REST_MOTION
+            for finished, position, before in zip(self.finished, self.positions, self._before, strict=True)
+        )
 
     def mark_positions(self, index: int) -> tuple[Point | None, ...]:
         """Return the target's disc and, once the puck is delivered and off the table, the place where it was."""
@@ -231,8 +302,6 @@ class Stack(Task):
     kind = ObjectKind("box", (0.02, 0.02, 0.02), mass=1.0, friction=0.5, multibody=True)
     tolerance = 0.03
     marks = (Mark("box", (0.01, 0.01, 0.01)),)
-    #: A block that moves less than this in one control step is at rest, metres.
-    rest_motion = 0.001
 
     def __init__(self) -> None:
         super().__init__()
@@ -260,19 +329,28 @@ class Stack(Task):
         targets[:, 2] = self.target_heights(n_objects)
         return starts, targets
 
-    def place(self, scene: Scene, starts: Points, targets: Points) -> None:
-        """Begin an episode: put the robot and the blocks into the world."""
-        super().place(scene, starts, targets)
+    def place(self, scene: Scene, starts: Points, targets: Points, n_done: int = 0, neutral: bool = False) -> None:
+        """Begin an episode; the blocks that are stacked already are the lowest. See :meth:`Task.place`."""
+        super().place(scene, starts, targets, n_done, neutral)
         self._before = self.positions
+
+    def hand_after(self, index: int) -> Hand:
+        """Return the place above the tower to which the open gripper rises."""
+        x, y, z = self.targets[index]
+        return Hand((x, y, z + RISEN), MAX_WIDTH)
+
+    def lying(self, finished: Points) -> Points:
+        """Return the place of the tower."""
+        return finished[:1]
 
     def target_heights(self, n_objects: int) -> Points:
         """Return the heights of the blocks in the tower, metres, ``(n,)``."""
         height = self.kind.height
         return np.array([height + 2 * height * level for level in range(n_objects)])
 
-    def read_start(self, n_objects: int, starts: Any, targets: Any) -> tuple[Points, Points]:
+    def read_start(self, n_objects: int, starts: Any, targets: Any, n_done: int = 0) -> tuple[Points, Points]:
         """Return starts and targets as :meth:`Task.read_start` does; the targets have one x and one y, the tower's."""
-        starts, targets = super().read_start(n_objects, starts, targets)
+        starts, targets = super().read_start(n_objects, starts, targets, n_done)
         if (targets[:, :2] != targets[0, :2]).any():
             raise ValueError(f"targets={targets.tolist()} are not accepted; x and y of a tower are the same in all")
         return starts, targets
@@ -286,6 +364,10 @@ class Stack(Task):
         """Return the block's own position."""
         return self.positions[index]
 
+    def approach(self, scene: Scene, index: int) -> float:
+        """Return the way around the block, with open fingers."""
+        return way_onto(scene.robot.position, scene.robot.width, self.positions[index], MAX_WIDTH)
+
     def mark_positions(self, index: int) -> tuple[Point | None, ...]:
         """Return a place in a small model of the tower, which stands beside it, where the gripper does not hide it."""
         x, y, _ = self.targets[index]
@@ -296,7 +378,7 @@ class Stack(Task):
         x, y, z = self.positions[index]
         gripper_x, gripper_y, gripper_z = scene.robot.position
         free = gripper_z - z > 0.03 or math.hypot(gripper_x - x, gripper_y - y) > 0.06
-        return free and math.dist(self.positions[index], self._before[index]) < self.rest_motion
+        return free and math.dist(self.positions[index], self._before[index]) < REST_MOTION
 
     def _finished(self, scene: Scene) -> list[bool]:
         there = super()._finished(scene)
@@ -308,6 +390,14 @@ class Stack(Task):
 def _on_table(starts: Points, targets: Points, height: float) -> tuple[Points, Points]:
     heights = np.full((len(starts), 1), height)
     return np.hstack((starts, heights)), np.hstack((targets, heights))
+
+
+def _beyond(place: Point, other: Point, way: float) -> Point:
+    """Return the point so far from a place in the direction of another one."""
+    x, y, z = place
+    way_x, way_y = other[0] - x, other[1] - y
+    share = way / max(math.hypot(way_x, way_y), 1e-6)
+    return x + share * way_x, y + share * way_y, z
 
 
 def _behind(position: Point, target: Point, back: float) -> Point:
