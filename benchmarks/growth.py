@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from study import train, write_results
+from study import commit, train, write_results
 
 from progpolicy_envs import find_domain
 from sb3_progpolicy.programs import Program, ProgramRunner
@@ -60,8 +60,8 @@ _HIKING = {
 #: By environment what differs from ``sb3_progpolicy/hyperparams/reptile_ppo.yml``.
 SETTINGS: Mapping[str, Mapping[str, Any]] = {
     "Pendulum-v1": _PENDULUM,
-    "CartPole-v1": {"n_timesteps": 300_000, "policy_kwargs": {"depth": 4}},
-    "Acrobot-v1": {"n_timesteps": 300_000, "policy_kwargs": {"depth": 4}},
+    "CartPole-v1": {"n_timesteps": 500_000, "policy_kwargs": {"depth": 4}},
+    "Acrobot-v1": {"n_timesteps": 500_000, "policy_kwargs": {"depth": 4}},
     "HikingEgo-v0": _HIKING,
 }
 _OF_ENV = {"Pendulum-v1": (0, 2, 4), "CartPole-v1": (0, 2), "Acrobot-v1": (0, 2), "HikingEgo-v0": (0, 2)}
@@ -145,6 +145,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3, help="number of seeds, from 0 on")
     parser.add_argument("--methods", nargs="+", help="growth, gradient, gradient_free or n_conditions=<k>")
     options = parser.parse_args()
+    commit()  # of the code that is run, whatever is checked out when it is through
     for env_id in options.env:
         fixed = [f"n_conditions={k}" for k in _OF_ENV[env_id]]
         methods = options.methods or ["growth", "gradient", "gradient_free", *fixed]

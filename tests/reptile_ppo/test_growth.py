@@ -1,5 +1,6 @@
 """Growth: conditions are tried one at a time, and stay if the return rises."""
 
+import itertools
 import json
 
 import gymnasium as gym
@@ -187,7 +188,7 @@ def test_condition_that_is_kept_is_trained_on(monkeypatch, short):
     assert len(model.program().controllers) == 3
     module = model.policy.module
     rows = module.controllers.weight.unflatten(0, (module.n_controllers, -1))[module.controllers_in_use]
-    assert not any(th.equal(one, other) for one, other in zip(rows[:-1], rows[1:], strict=True))
+    assert not any(th.equal(one, other) for one, other in itertools.pairwise(rows))
 
 
 def test_between_meta_iterations_the_model_is_the_program_without_the_trial(short):
