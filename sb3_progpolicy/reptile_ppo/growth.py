@@ -137,9 +137,15 @@ class Growth:
         :param state: JSON values
         :param parameters: ``None`` between trials
         :param model: a ReptilePPO, whose parameters are restored already
+        :raises ValueError: if it is something else
         """
-        self.waited, self.rounds, self.refused = (int(state[name]) for name in ("waited", "rounds", "refused"))
-        self.trials, self.arm = list(state["trials"]), None
+        counts, trials = [state[name] for name in ("waited", "rounds", "refused")], state["trials"]
+        if any(type(count) is not int or count < 0 for count in counts) or not isinstance(trials, list):
+            raise ValueError(f"growth={state!r:.80} is not accepted; it holds counts and a list of trials")
+        if any(not isinstance(trial, dict) or type(trial.get("kept")) is not bool for trial in trials):
+            raise ValueError(f"growth: trials={trials!r:.80} is not accepted; each says whether a condition was kept")
+        self.waited, self.rounds, self.refused = counts
+        self.trials, self.arm = trials, None
         if parameters is None:
             return
         scaler = copy.deepcopy(model.reward_scaler)
