@@ -60,8 +60,8 @@ _HIKING = {
 #: By environment what differs from ``sb3_progpolicy/hyperparams/reptile_ppo.yml``.
 SETTINGS: Mapping[str, Mapping[str, Any]] = {
     "Pendulum-v1": _PENDULUM,
-    "CartPole-v1": {"n_timesteps": 500_000, "policy_kwargs": {"depth": 4}},
-    "Acrobot-v1": {"n_timesteps": 500_000, "policy_kwargs": {"depth": 4}},
+    "CartPole-v1": {"n_timesteps": 300_000, "policy_kwargs": {"depth": 4}},
+    "Acrobot-v1": {"n_timesteps": 300_000, "policy_kwargs": {"depth": 4}},
     "HikingEgo-v0": _HIKING,
 }
 _OF_ENV = {"Pendulum-v1": (0, 2, 4), "CartPole-v1": (0, 2), "Acrobot-v1": (0, 2), "HikingEgo-v0": (0, 2)}

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, get_args
@@ -200,6 +201,11 @@ class Growth:
             return
         chosen = tries(rank_divisions(model.policy, experience), self.refused)
         if chosen is None:
+            warnings.warn(
+                f"growth: at step {model.num_timesteps} there was nothing to divide; none of the last two branches was "
+                "reached often enough, or what they read does not change",
+                stacklevel=2,
+            )
             return
         mine = Arm.of(model)
         divide(model.policy.module, chosen.division, model.policy.optimizer)
@@ -230,9 +236,7 @@ class Growth:
         n_conditions = model.search.most_likely() + (not outcome.pays)
         told: dict[str, Any] = {"timesteps": model.num_timesteps, "n_conditions": n_conditions, **asdict(outcome)}
         told |= {"rounds": self.rounds, "kept": outcome.pays}
-        self.trials.append(
-            {name: value.item() if isinstance(value, np.generic) else value for name, value in told.items()}
-        )
+        self.trials.append(told)
         for name in ("return_before", "rise", "rise_std_error", "price"):
             model.logger.record(f"growth/{name}", told[name])
         kept = sum(trial["kept"] for trial in self.trials)

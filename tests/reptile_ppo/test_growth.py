@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 from sb3_progpolicy import ReptileCheckpoint, ReptilePPO
 from sb3_progpolicy.experiment.config import make_config
 from sb3_progpolicy.experiment.run import build_model
-from sb3_progpolicy.programs import load_program
+from sb3_progpolicy.programs import ProgramRunner, load_program
 from sb3_progpolicy.reptile_ppo.growth import COMPARE
 from sb3_progpolicy.reptile_ppo.inner_loops import Learning
 from sb3_progpolicy.reptile_ppo.returns import MAX_STEPS, MIN_EPISODES, Comparison, episode_returns
@@ -100,25 +100,27 @@ class Stop(BaseCallback):
 
 
 def test_condition_that_is_needed_is_found_and_kept():
-    model = learner(product=True).learn(80_000)
+    model = learner(product=True).learn(60_000)
     assert model.growth.trials[0]["kept"] or model.growth.trials[1]["kept"]
     program = model.program()
     assert 1 <= len(program.conditions) <= 3
-    assert np.mean(model.ep_success_buffer) > 0.85, "one affine controller is right half of the time"
+    x = np.random.default_rng(0).uniform(-1, 1, (1000, 2))
+    right = ProgramRunner(program, 1000).act(x) == (x[:, 0] * x[:, 1] > 0)
+    assert right.mean() > 0.85, "one affine controller is right at most in three quarters"
     assert program.metadata["growth"] == model.growth.trials
     kept = [trial["n_conditions"] for trial in model.growth.trials if trial["kept"]]
     assert kept == list(range(1, len(program.conditions) + 1))
 
 
 def test_condition_that_is_not_needed_is_taken_back():
-    model = learner(product=False).learn(150_000)
+    model = learner(product=False, growth_iterations=4).learn(60_000)
     assert len(model.growth.trials) >= 2
     assert not any(trial["kept"] for trial in model.growth.trials)
     assert len(model.program().conditions) == 0
 
 
 def test_high_price_keeps_nothing():
-    model = learner(product=True, length_coef=100.0).learn(100_000)
+    model = learner(product=True, length_coef=100.0, growth_iterations=4).learn(40_000)
     assert len(model.growth.trials) >= 2
     assert len(model.program().conditions) == 0
 
@@ -167,6 +169,14 @@ def test_condition_that_is_taken_back_leaves_no_trace(monkeypatch, short):
     assert len(tried.growth.trials) == 1
     assert not plain.growth.trials
     assert th.equal(weights(tried), weights(plain))
+
+
+def test_inputs_that_never_change_leave_nothing_to_divide(short):
+    env = VecMonitor(DummyVecEnv([lambda: Walk(5)] * 4))
+    model = make("PRLPolicy", env, **GROWTH | {"tasks": None}, interaction_history=False)
+    with pytest.warns(UserWarning, match="nothing to divide"):
+        model.learn(ROLLOUT * 5)
+    assert model.growth.trials == []
 
 
 def test_steps_of_both_programs_and_of_the_comparison_are_counted(monkeypatch, short):
@@ -227,7 +237,7 @@ def test_after_the_search_no_trial_is_begun_and_an_open_one_is_brought_to_its_en
 
 
 @pytest.mark.parametrize("policy", ["ProgPolicy", "PRLPolicy"])
-@pytest.mark.parametrize("env_id", ["Hanoi-v0", "PandaReach-v0"])
+@pytest.mark.parametrize("env_id", ["Hanoi-v0", "Stacking-v0"])
 def test_tied_program_stays_one_as_it_grows(env_id, policy, monkeypatch, short):
     keep(monkeypatch, True)
     model = make(policy, env_id, **GROWTH | {"tasks": None}, symmetric=True, n_envs=8, search_fraction=1.0)
