@@ -26,7 +26,7 @@ from sb3_progpolicy.vec_env import make_fast_vec_env
 
 EVALUATION_SEED, EPISODES = 10_000, 100
 COLUMNS = ("method", "seed", "variations", "episodes", "return_mean", "return_std", "success_rate", "n_conditions")
-COLUMNS += ("tried", "kept", "timesteps", "train_seconds")
+COLUMNS += ("tried", "kept", "timesteps")
 _PENDULUM = {
     "n_timesteps": 400_000,
     "n_envs": 32,
@@ -131,7 +131,6 @@ def run(env_id: str, method: str, seed: int) -> list[dict[str, Any]]:
                 "tried": len(trials),
                 "kept": sum(trial["kept"] for trial in trials),
                 "timesteps": program.metadata["timesteps"],
-                "train_seconds": program.metadata["train_seconds"],
             }
         )
         print(*rows[-1].values(), flush=True)
