@@ -41,7 +41,7 @@ class Candidate:
     :param division: of a branch
     :param statistic: mean over the controller's parameters of how far the sum of the gradients on one side is from 0,
         in variances of such a sum; about 1 where a division means nothing
-    :param inputs: which input a division along an axis reads; -1 for a slanted one
+    :param input: which input a division along an axis reads; -1 for a slanted one
     """
 
     division: Division
@@ -120,7 +120,9 @@ def _cuts(inputs: Array, scores: Array) -> list[tuple[tuple[tuple[float, ...], f
     mean, deviation = inputs.mean(0), inputs.std(0)
     cuts: list[Any] = []
     best: tuple[float, NDArray[np.bool_]] | None = None
-    for number in np.flatnonzero(deviation > 1e-6):
+    # Under a symmetry the inputs of an orbit have the same mean; the first stands for all.
+    different = np.sort(np.unique(inputs.round(9), axis=1, return_index=True)[1])
+    for number in different[deviation[different] > 1e-6]:
         threshold, statistic = _best_threshold(inputs[:, number], scores)
         if threshold is None:
             continue
