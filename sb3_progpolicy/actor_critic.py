@@ -288,6 +288,27 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
         features, critic_features = self._split_features(obs)
         return self._values(critic_features), self._distribution(features, condition_values).log_prob(actions)
 
+    def output_gradients(
+        self, obs: th.Tensor, condition_values: th.Tensor, actions: th.Tensor, advantages: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """Return where each state's policy gradient would move the outputs of the controllers.
+
+        :param obs: ``(n, n_inputs)``
+        :param condition_values: the values of B, ``(n, depth - 1)``
+        :param actions: ``(n,)`` or ``(n, ...)``
+        :param advantages: ``(n,)``
+        :return: X, ``(n, n_inputs)``; the gradient of ``advantage * log_prob`` by the outputs of the controllers in
+            use, ``(n_in_use, n, n_outputs)``; the weights of these controllers, ``(n, n_in_use)``
+        """
+        with th.no_grad():
+            features, _ = self._split_features(obs)
+            weights = self.module.mixture_weights(condition_values)
+            outputs = self.module.controller_outputs(features)
+        outputs.requires_grad_(True)
+        log_prob = self._distribution_of(self.module.mix_outputs(outputs, weights)).log_prob(actions)
+        (gradients,) = th.autograd.grad((advantages * log_prob).sum(), outputs)
+        return features, gradients.permute(0, 2, 1), weights
+
     def crisp_disagreement(self, obs: th.Tensor, condition_values: th.Tensor) -> float:
         """Return the share of steps on which soft and crisp program would not choose the same.
 

@@ -37,7 +37,8 @@ def extract_program(model: BaseAlgorithm, **metadata: Any) -> Program:
 
     It reads what the environment gives. What ``VecNormalize`` does to observations is folded into it, which is exact as
     long as ``clip_obs`` is not reached. Other wrappers are named in ``metadata["wrappers"]``, and
-    the symmetry that ties the weights in ``metadata["symmetry"]``.
+    the symmetry that ties the weights in ``metadata["symmetry"]``, and the conditions that were tried in
+    ``metadata["growth"]`` (``search_method="growth"`` of ReptilePPO).
 
     :param model: of any algorithm, with the policy ``ProgPolicy`` or ``PRLPolicy``
     :param metadata: JSON values to keep with it; environment id, seed, number of steps and way of
@@ -59,6 +60,9 @@ def extract_program(model: BaseAlgorithm, **metadata: Any) -> Program:
     origin["learned_by"] = getattr(model, "learned_by", LEARNED_BY[0])
     if policy.module.group is not None:
         origin["symmetry"] = policy.module.group.members[0].name
+    growth = getattr(model, "growth", None)
+    if growth is not None:
+        origin["growth"] = growth.trials
     if wrappers:
         origin["wrappers"] = list(wrappers)
     # A saved model's tuples are loaded as lists.

@@ -114,6 +114,15 @@ class RewardScaler:
         scaled = rewards / np.sqrt(self.statistics.var + EPSILON)
         return np.clip(scaled, -CLIP_REWARD, CLIP_REWARD).astype(np.float32)
 
+    def state(self) -> list[float]:
+        """Return the statistics: mean, variance and number of the returns."""
+        return [float(x) for x in (self.statistics.mean, self.statistics.var, self.statistics.count)]
+
+    def restore(self, state: Sequence[float]) -> None:
+        """Take over what :meth:`state` has returned."""
+        mean, variance, count = map(np.float64, state)
+        self.statistics.mean, self.statistics.var, self.statistics.count = mean, variance, float(count)
+
     def reset_returns(self) -> None:
         """Start the running returns anew, as at a task switch; the statistics stay."""
         self._returns = np.zeros(0)

@@ -41,7 +41,7 @@ def test_names_of_release_0_1_still_work_and_say_what_they_are_called_now():
     assert not env.observation(np.zeros(4))[4:].any()
     with pytest.warns(DeprecationWarning, match=r"sb3_progpolicy\.reptile\.tasks"):
         from sb3_progpolicy.tasks import UniformSampler
-    assert UniformSampler.__module__ == "sb3_progpolicy.reptile.tasks"
+    assert UniformSampler.__module__ == "sb3_progpolicy.reptile.samplers"
     from sb3_progpolicy.programs.syntax import Program
 
     assert isinstance(runner.program, Program)

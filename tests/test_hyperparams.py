@@ -1,9 +1,12 @@
+import json
+
 import pytest
 
-from sb3_progpolicy.experiment.config import make_config
+from sb3_progpolicy.experiment.config import _accepted, make_config, parse_config
 from sb3_progpolicy.experiment.methods import METHODS
 from sb3_progpolicy.experiment.run import build_model
-from sb3_progpolicy.hyperparams import algorithms, load_hyperparams, parse_kwargs, parse_value
+from sb3_progpolicy.hyperparams import DEFAULT, SEARCH, algorithms, load_hyperparams, parse_kwargs, parse_value
+from sb3_progpolicy.reptile.samplers import CurriculumSampler, ProgressSampler
 
 
 @pytest.mark.parametrize("algo", list(METHODS))
@@ -86,6 +89,8 @@ def test_timeouts_are_terminal_where_a_file_or_the_command_line_says_so():
         ({"policy": "ProgPol"}, "nearest: ProgPolicy"),
         ({"policy_kwargs": {"dept": 3}}, "nearest: depth"),
         ({"gamma": "high"}, "gamma='high'"),
+        ({"sampler": "hardest"}, "sampler='hardest' is not accepted; known samplers: uniform, curriculum"),
+        ({"sampler": {"name": "failure", "flor": 1}}, "flor=1 is not accepted; failure takes floor"),
         ({"init_program": 3}, "init_program=3 is not accepted; it is a file or the name of a shipped program"),
     ],
 )
@@ -101,3 +106,27 @@ def test_unknown_names_are_answered_with_the_nearest():
         make_config("reptile_ppo", "Hanoy-v0", 0)
     with pytest.raises(ValueError, match="nearest: n_discs"):
         make_config("reptile_ppo", "Hanoi-v0", 0, env_kwargs={"n_disc": 3})
+
+
+@pytest.mark.parametrize("algo", ["reptile_ppo", "reptile_mlp", "recurrent_ppo_multitask"])
+@pytest.mark.parametrize(("sampler", "made"), [
+    ("progress", ProgressSampler()),
+    ({"name": "curriculum", "fraction": 0.5}, CurriculumSampler(0.5)),
+])  # fmt: skip
+def test_sampler_is_set_in_a_file_with_tasks_and_without(algo, sampler, made):
+    for tasks in ({}, {"tasks": {"n_discs": [1, 2, 3]}}):
+        config = make_config(algo, "Hanoi-v0", 0, overrides={"sampler": sampler, "n_envs": 2, **tasks})
+        model, wrapper = build_model(parse_config(json.loads(json.dumps(vars(config), default=dict))))
+        distribution = model.tasks if wrapper is None else wrapper.tasks
+        assert distribution.sampler == made
+        assert len(distribution) == (3 if tasks else 4)
+
+
+def test_sampler_is_read_from_the_command_line():
+    assert parse_value("{name: curriculum, fraction: 0.5}") == {"name": "curriculum", "fraction": 0.5}
+
+
+def test_names_of_a_tuning_section_and_of_hyperparameters_do_not_clash():
+    for algo in algorithms():
+        accepted = _accepted(algo)
+        assert not {SEARCH, DEFAULT} & set(accepted)

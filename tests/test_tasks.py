@@ -11,7 +11,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from progpolicy_envs import DOMAINS
 from sb3_progpolicy import ReptilePPO, ReptileWrapper, TaskDistribution
 from sb3_progpolicy.reptile.checks import check_variations
-from sb3_progpolicy.reptile.tasks import CurriculumSampler, FailureSampler, RemakeOnVariation, default_tasks
+from sb3_progpolicy.reptile.samplers import CurriculumSampler, FailureSampler, ProgressSampler, make_sampler
+from sb3_progpolicy.reptile.tasks import RemakeOnVariation, default_tasks
 from sb3_progpolicy.vec_env import make_fast_vec_env
 
 
@@ -58,6 +59,96 @@ def test_failure_sampler_prefers_what_fails():
     tasks.record(1, 0.0)
     counts = np.bincount([index for index, _ in drawn(tasks, 2300)])
     np.testing.assert_allclose(counts, [100, 1100, 1100], atol=110)  # the third is untried: as if it failed
+
+
+def progressing(scores, sampler="progress", as_return=False):
+    """A distribution whose variations have had these successes, or returns, one after the other."""
+    tasks = TaskDistribution({"n": range(len(scores))}, sampler=sampler)
+    for index, values in enumerate(scores):
+        for value in values:
+            tasks.record(index, None if as_return else value, value if as_return else None)
+    return tasks
+
+
+@pytest.mark.parametrize("as_return", [False, True])
+def test_progress_sampler_prefers_what_changes_up_or_down(as_return):
+    still, rises, falls = [0.5] * 20, [0.0] * 10 + [1.0] * 10, [1.0] * 10 + [0.0] * 10
+    tasks = progressing([still, rises, falls], ProgressSampler(floor=0.3), as_return)
+    assert tasks.learning_progress[0] == 0
+    assert tasks.learning_progress[1] == pytest.approx(tasks.learning_progress[2])
+    counts = np.bincount([index for index, _ in drawn(tasks, 3000)])
+    np.testing.assert_allclose(counts, [300, 1350, 1350], atol=110)
+
+
+def test_progress_is_measured_by_success_where_there_is_one():
+    tasks = progressing([[0.5, 0.5]])
+    tasks.record(0, 0.5, 1000.0)
+    assert tasks.learning_progress[0] == 0
+
+
+def test_progress_sampler_draws_what_is_new_as_often_as_what_changes_most():
+    tasks = progressing([[0.0] * 5 + [1.0], [0.0] * 5 + [0.5], []], ProgressSampler(floor=0.1))
+    counts = np.bincount([index for index, _ in drawn(tasks, 3000)])
+    assert counts[2] == pytest.approx(counts[0], rel=0.15)
+    assert counts[0] > 1.5 * counts[1]
+
+
+def test_progress_sampler_is_uniform_before_anything_changes():
+    for scores in ([[], [], []], [[0.5, 0.5]] * 3):
+        counts = np.bincount([index for index, _ in drawn(progressing(scores), 3000)])
+        np.testing.assert_allclose(counts, 1000, atol=110)
+
+
+def test_old_progress_is_forgotten():
+    tasks = progressing([[0.0] * 5 + [1.0]])
+    before = tasks.learning_progress[0]
+    for _ in range(100):
+        tasks.record(0, 1.0)
+    assert tasks.learning_progress[0] < 0.05 * before
+
+
+def test_trained_model_tells_the_sampler_of_successes_or_of_returns(tmp_path):
+    poles = TaskDistribution({"length": [0.3, 0.9]}, "progress", apply="attributes")
+    discs = TaskDistribution({"n_discs": [1, 3]}, "progress")
+    for env, tasks in ((make_vec_env("CartPole-v1", 4), poles), (make_fast_vec_env("Hanoi-v0", 4), discs)):
+        model = ReptilePPO("ProgPolicy", env, tasks=tasks, seed=0, device="cpu").learn(4096)
+        if tasks is poles:
+            assert (poles.learning_progress > 0).all()
+            assert np.isnan(poles.success_rates).all()
+        else:
+            np.testing.assert_array_equal(discs.scores[0], discs.success_rates)
+        model.save(tmp_path / "model.zip")
+        loaded = ReptilePPO.load(tmp_path / "model.zip", device="cpu")
+        assert loaded.tasks.sampler == ProgressSampler()
+        np.testing.assert_array_equal(loaded.tasks.scores, model.tasks.scores)
+
+
+def test_sampler_is_given_by_itself_and_changed_in_loading(tmp_path):
+    model = ReptilePPO("ProgPolicy", "Hanoi-v0", n_envs=2, sampler={"name": "curriculum", "fraction": 0.5})
+    assert model.tasks.variations == list(DOMAINS["Hanoi-v0"].train)
+    assert model.tasks.sampler == CurriculumSampler(0.5)
+    given = TaskDistribution({"n_discs": [1, 2]}, "failure")
+    assert ReptilePPO("ProgPolicy", "Hanoi-v0", n_envs=2, tasks=given).tasks.sampler == FailureSampler()
+    assert ReptilePPO("ProgPolicy", "Hanoi-v0", n_envs=2, tasks=given, sampler="progress").tasks.sampler.floor == 0.2
+    model.save(tmp_path / "model.zip")
+    loaded = ReptilePPO.load(tmp_path / "model.zip", sampler="progress", device="cpu")
+    assert loaded.tasks.sampler == ProgressSampler()
+
+
+@pytest.mark.parametrize(("given", "message"), [
+    ("best", "known samplers: uniform, curriculum, failure, progress"),
+    ({"fraction": 0.5}, "known samplers"),
+    ({"name": "curriculum", "fracton": 0.5}, "fracton=0.5 is not accepted; curriculum takes fraction"),
+    ({"name": "uniform", "floor": 0.5}, "floor=0.5 is not accepted; uniform takes nothing"),
+    ({"name": "progress", "floor": "much"}, "floor='much' is not accepted; it is a number"),
+    ({"name": "progress", "floor": 0.0}, "floor=0.0 is not accepted; it is above 0 and at most 1"),
+    ({"name": "progress", "floor": 1.5}, "floor=1.5 is not accepted"),
+    ({"name": "curriculum", "fraction": 2}, "fraction=2 is not accepted"),
+    (3, "known samplers"),
+])  # fmt: skip
+def test_sampler_that_there_is_not_is_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        make_sampler(given)
 
 
 def test_success_rates_are_running_means():

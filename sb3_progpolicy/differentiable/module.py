@@ -148,12 +148,19 @@ class ProgramModule(nn.Module):
             log-odds for MultiBinary; with branches, ``(..., n_in_use * (1 + n_outputs))``: the logarithms of the
             weights, then the controllers' outputs
         """
+        mixed = self.mix_outputs(self.controller_outputs(inputs), mixture_weights.flatten(0, -2))
+        return mixed.unflatten(0, inputs.shape[:-1])
+
+    def mix_outputs(self, outputs: th.Tensor, mixture_weights: th.Tensor) -> th.Tensor:
+        """Return what :meth:`mix` returns, for outputs that are known.
+
+        :param outputs: of the controllers in use, from :meth:`controller_outputs`
+        :param mixture_weights: ``(rows, n_in_use)``
+        """
         if self.mixes_branches:
-            outputs = self._terms(inputs).permute(2, 0, 1).flatten(1).unflatten(0, inputs.shape[:-1])
-            return th.cat((_log(mixture_weights), outputs), dim=-1)
-        weights = mixture_weights.flatten(0, -2).T.unsqueeze(1)
-        mixed = (weights * self._terms(inputs)).sum(0)
-        return self._to_parameters(mixed.T.unflatten(0, inputs.shape[:-1]))
+            return th.cat((_log(mixture_weights), outputs.permute(2, 0, 1).flatten(1)), dim=-1)
+        mixed = (mixture_weights.T.unsqueeze(1) * self._to_terms(outputs)).sum(0)
+        return self._to_parameters(mixed.T)
 
     def derivation_terms(self, inputs: th.Tensor, condition_values: th.Tensor) -> th.Tensor:
         """Return the matrices by which the mixture is linear in W's probabilities, as long as phi stays.
@@ -179,10 +186,12 @@ class ProgramModule(nn.Module):
             return th.cat((_log(terms[:, : len(choices)] * choices), terms[:, len(choices) :]), dim=1)
         return self._to_parameters(terms @ self.choices())
 
-    def _terms(self, inputs: th.Tensor) -> th.Tensor:
-        """Return what is mixed, ``(n_in_use, n_terms, rows)``: values, or probabilities.
+    def controller_outputs(self, inputs: th.Tensor) -> th.Tensor:
+        """Return the outputs of the controllers in use, ``(n_in_use, n_outputs, rows)``.
 
         Rows come last: softmax and sums then run along contiguous memory, twice as fast as over a last axis of a few.
+
+        :param inputs: X, ``(..., n_inputs)``
         """
         (weight, bias), in_use = self.controller_parameters(), self.controllers_in_use
         if len(in_use) < self.n_controllers:
@@ -191,7 +200,13 @@ class ProgramModule(nn.Module):
                 block.unflatten(0, (self.n_controllers, -1))[rows].flatten(0, 1) for block in (weight, bias)
             )
         outputs = th.addmm(bias.unsqueeze(1), weight, inputs.flatten(0, -2).T)
-        outputs = outputs.unflatten(0, (len(in_use), self.action.n_outputs))
+        return outputs.unflatten(0, (len(in_use), self.action.n_outputs))
+
+    def _terms(self, inputs: th.Tensor) -> th.Tensor:
+        """Return what is mixed, ``(n_in_use, n_terms, rows)``: values, or probabilities."""
+        return self._to_terms(self.controller_outputs(inputs))
+
+    def _to_terms(self, outputs: th.Tensor) -> th.Tensor:
         if self.action.kind == "box":
             return outputs
         if self.action.kind == "multi_binary":

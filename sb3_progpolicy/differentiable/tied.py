@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch as th
+from numpy.typing import NDArray
 from torch import nn
 
 from sb3_progpolicy.symmetries import Ties
@@ -35,6 +37,11 @@ class TiedLinear(nn.Module):
     def bias(self) -> th.Tensor:
         """``(n_maps * n_outputs,)``."""
         return self.expand()[1]
+
+    def ties_of_weights(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return which free number each weight and bias is, and its sign, both ``(n_outputs, n_inputs + 1)``."""
+        sign = self._sign.cpu().numpy().astype(np.float64)
+        return self._index.cpu().numpy().reshape(sign.shape), sign
 
     def expand(self) -> tuple[th.Tensor, th.Tensor]:
         """Return weights and biases, both of one computation."""

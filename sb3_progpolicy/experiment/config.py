@@ -17,11 +17,20 @@ from sb3_progpolicy.experiment.methods import METHODS, get_method
 from sb3_progpolicy.hyperparams import load_hyperparams, parse_kwargs, parse_number, shortened
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.reptile.callback import ReptileWrapper
+from sb3_progpolicy.reptile.samplers import make_sampler
 from sb3_progpolicy.reptile_ppo.environments import DEFAULT_N_ENVS
 from sb3_progpolicy.reptile_ppo.sequence_ppo import Timeouts
 
 #: Hyperparameters of ReptileWrapper, which a stock algorithm is trained with if any of them is given.
-REPTILE = ("tasks", "inner_updates", "tasks_per_iteration", "meta_learning_rate", "meta_optimizer", "meta_update")
+REPTILE = (
+    "tasks",
+    "sampler",
+    "inner_updates",
+    "tasks_per_iteration",
+    "meta_learning_rate",
+    "meta_optimizer",
+    "meta_update",
+)
 #: Largest seed, number of environments, and number of transitions in a rollout.
 MAX_SEED, MAX_ENVS, MAX_ROLLOUT = 2**32 - 1, 2**16, 2**28
 _SCHEDULES = (
@@ -205,9 +214,9 @@ def _accepted(algo: str) -> dict[str, Any]:
         accepted["interaction_history"] = False
     if method.takes_tasks and not method.has_reptile:
         reptile = inspect.signature(ReptileWrapper.__init__).parameters
-        accepted |= {name: reptile[name].default for name in REPTILE}
+        accepted |= {name: reptile[name].default for name in REPTILE if name in reptile}
     accepted.pop("env_kwargs", None)
-    return {**accepted, "policy": "", "tasks": None, "n_envs": DEFAULT_N_ENVS, "n_timesteps": 1}
+    return {**accepted, "policy": "", "tasks": None, "sampler": None, "n_envs": DEFAULT_N_ENVS, "n_timesteps": 1}
 
 
 def _checked(name: str, value: Any, default: Any) -> Any:
@@ -217,6 +226,9 @@ def _checked(name: str, value: Any, default: Any) -> Any:
         return parse_kwargs(name, value)
     if name == "init_program" and value is not None and not isinstance(value, str):
         raise ValueError(f"{name}={shortened(value)} is not accepted; it is a file or the name of a shipped program")
+    if name == "sampler" and value is not None:
+        make_sampler(value)
+        return value
     if value is None and (default is None or name == "batch_size"):
         return None
     if name in _SCHEDULES:

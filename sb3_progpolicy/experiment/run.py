@@ -35,7 +35,7 @@ from sb3_progpolicy.programs.files import write_atomically
 from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.reptile.callback import ReptileWrapper
 from sb3_progpolicy.reptile.checkpoint import ReptileCheckpoint, load_last_good, previous_of
-from sb3_progpolicy.reptile.tasks import TaskDistribution, default_tasks
+from sb3_progpolicy.reptile.tasks import TaskDistribution, make_tasks
 from sb3_progpolicy.reptile_ppo.environments import make_venv
 from sb3_progpolicy.vec_env.worker import WorkerDiedError, interrupts_deferred
 
@@ -73,15 +73,15 @@ def build_model(
 
 
 def _reptile_wrapper(config: RunConfig, arguments: dict[str, Any]) -> ReptileWrapper:
-    arguments.pop("tasks", None)
+    for name in ("tasks", "sampler"):
+        arguments.pop(name, None)
     return ReptileWrapper(_tasks(config), **arguments)
 
 
 def _tasks(config: RunConfig) -> TaskDistribution:
     """Return the tasks of a configuration in the form that has an effect on its environment."""
-    tasks = config.hyperparams.get("tasks")
-    distribution = default_tasks(config.env) if tasks is None else TaskDistribution(tasks)
-    return distribution.fit_to(config.env, config.env_kwargs)
+    tasks, sampler = config.hyperparams.get("tasks"), config.hyperparams.get("sampler")
+    return make_tasks(tasks, sampler, config.env, True, config.env_kwargs)
 
 
 def make_env(config: RunConfig) -> VecEnv:

@@ -21,9 +21,10 @@ class EpisodeStatistics:
 
     def __init__(self, tasks: TaskDistribution) -> None:
         self.tasks = tasks
-        self.recorded: list[tuple[int, float]] = []  # index of a variation and its success rate, as told to the tasks
+        self.recorded: list[tuple[int, float | None, float | None]] = []  # as told to the tasks
         self._successes: dict[int, list[float]] = defaultdict(list)
         self._lengths: dict[int, list[float]] = defaultdict(list)
+        self._returns: dict[int, list[float]] = defaultdict(list)
 
     def add(self, indices: Sequence[int], dones: NDArray[np.bool_], infos: Sequence[dict[str, Any]]) -> None:
         """Take in the episodes that ended with a step.
@@ -37,18 +38,24 @@ class EpisodeStatistics:
                 self._successes[indices[row]].append(float(infos[row]["is_success"]))
             if "episode" in infos[row]:
                 self._lengths[indices[row]].append(float(infos[row]["episode"]["l"]))
+                self._returns[indices[row]].append(float(infos[row]["episode"]["r"]))
 
     def flush(self, logger: Logger) -> None:
         """Log the means as ``success/<variation>`` and ``steps/<variation>`` and begin anew.
 
         :param logger: of the model
         """
-        for index, successes in self._successes.items():
-            rate = float(np.mean(successes))
-            self.recorded.append((index, rate))
-            self.tasks.record(index, rate)
-            logger.record(f"success/{self.tasks.label(index)}", rate)
+        for index in dict.fromkeys((*self._successes, *self._returns)):
+            success, episode_return = _mean(self._successes, index), _mean(self._returns, index)
+            self.recorded.append((index, success, episode_return))
+            self.tasks.record(index, success, episode_return)
+            if success is not None:
+                logger.record(f"success/{self.tasks.label(index)}", success)
         for index, lengths in self._lengths.items():
             logger.record(f"steps/{self.tasks.label(index)}", float(np.mean(lengths)))
-        self._successes.clear()
-        self._lengths.clear()
+        for collected in (self._successes, self._lengths, self._returns):
+            collected.clear()
+
+
+def _mean(collected: dict[int, list[float]], index: int) -> float | None:
+    return float(np.mean(collected[index])) if index in collected else None

@@ -139,6 +139,10 @@ class MetaOptimizer:
         if self._state is not None:
             self._state["state"].pop(index, None)
 
+    def reset(self) -> None:
+        """Drop all that is remembered."""
+        self._state = None
+
     def state_dict(self) -> dict[str, Any]:
         """Return the optimizer's state; empty before the first step."""
         return self._state or {}

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from typing import Any, Literal
@@ -17,79 +15,16 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from progpolicy_envs import find_domain
 from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, unread_names
+from sb3_progpolicy.reptile.samplers import CurriculumSampler, FailureSampler, Sampler, UniformSampler, make_sampler
+
+__all__ = ["RemakeOnVariation", "TaskDistribution", "Variation", "default_tasks", "make_tasks"]
+__all__ += ["CurriculumSampler", "FailureSampler", "Sampler", "UniformSampler"]  # models of release 0.1 look here
 
 Variation = dict[str, Any]
 Draw = Callable[[np.random.Generator], Any]
 Apply = Literal["options", "attributes", "constructor"]
 APPLY: tuple[Apply, ...] = ("options", "attributes", "constructor")
 MAX_LABEL = 30  # characters that SB3's table of logs shows
-
-
-class Sampler(ABC):
-    """Decides which variation comes next."""
-
-    @abstractmethod
-    def weights(self, n_variations: int, progress: float, success_rates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how likely each variation is, up to a factor.
-
-        :param n_variations: how many there are, ordered from the easiest
-        :param progress: of the training, from 0 to 1
-        :param success_rates: running success rate of each variation, NaN where it has not been tried
-        :return: ``(n_variations,)``, non-negative, not all 0
-        """
-
-
-@dataclass(frozen=True)
-class UniformSampler(Sampler):
-    """Every variation is equally likely."""
-
-    def weights(self, n_variations: int, progress: float, success_rates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See :meth:`Sampler.weights`."""
-        return np.ones(n_variations)
-
-
-@dataclass(frozen=True)
-class CurriculumSampler(Sampler):
-    """Starts with the easiest variation and lets in the others one by one, in order.
-
-    :param fraction: of the training, above 0 and up to 1, after which all of them are in
-    """
-
-    fraction: float = 0.7
-
-    def __post_init__(self) -> None:
-        if not 0 < self.fraction <= 1:
-            raise ValueError(f"fraction={self.fraction} is not accepted; it is above 0 and at most 1")
-
-    def weights(self, n_variations: int, progress: float, success_rates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See :meth:`Sampler.weights`."""
-        n_in = 1 + int(n_variations * progress / self.fraction)
-        return (np.arange(n_variations) < n_in).astype(np.float64)
-
-
-@dataclass(frozen=True)
-class FailureSampler(Sampler):
-    """The more often a variation fails, the likelier it is.
-
-    :param floor: weight of a variation that never fails, above 0; one that always fails, or is new, has ``1 + floor``
-    """
-
-    floor: float = 0.1
-
-    def __post_init__(self) -> None:
-        if not self.floor > 0:
-            raise ValueError(f"floor={self.floor} is not accepted; it is above 0")
-
-    def weights(self, n_variations: int, progress: float, success_rates: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See :meth:`Sampler.weights`."""
-        return 1 + self.floor - np.nan_to_num(success_rates, nan=0.0)
-
-
-SAMPLERS: dict[str, type[Sampler]] = {
-    "uniform": UniformSampler,
-    "curriculum": CurriculumSampler,
-    "failure": FailureSampler,
-}
 
 
 class TaskDistribution:
@@ -104,7 +39,8 @@ class TaskDistribution:
     :param variations: a mapping from parameter to values (a sequence, a ``range``, or a callable that draws a value
         from a ``numpy.random.Generator``), of which all combinations are taken; or a sequence of such mappings from
         parameter to one value, the same parameters in all. Order them from the easiest for a curriculum.
-    :param sampler: ``"uniform"``, ``"curriculum"``, ``"failure"`` or a :class:`Sampler`
+    :param sampler: ``"uniform"``, ``"curriculum"``, ``"failure"``, ``"progress"``, a mapping of ``name`` and the
+        arguments of one of these, or a :class:`~sb3_progpolicy.reptile.samplers.Sampler`
     :param apply: how a variation is put in force: ``"options"`` by ``reset(options=...)``, which the environment must
         keep in force over the episodes that follow, as all of ``progpolicy_envs`` do; ``"attributes"`` by setting
         attributes of the environment, ``"constructor"`` by making the environment anew (see
@@ -117,22 +53,21 @@ class TaskDistribution:
 
     #: Weight of the newest episodes in the running success rates.
     SUCCESS_SMOOTHING = 0.2
+    #: Weight of the newest episodes in the newer and the older running mean of the scores.
+    SCORE_SMOOTHING = (0.2, 0.05)
     check = True  # of those saved by release 0.1
 
     def __init__(
         self,
         variations: Mapping[str, Any] | Sequence[Mapping[str, Any]],
-        sampler: str | Sampler = "uniform",
+        sampler: str | Mapping[str, Any] | Sampler = "uniform",
         apply: Apply = "options",
         check: bool = True,
     ) -> None:
         self.variations = _enumerate(variations)
         if not self.variations:
             raise ValueError(f"variations={variations!r} is not accepted; at least one variation is needed")
-        if isinstance(sampler, str):
-            if sampler not in SAMPLERS:
-                raise ValueError(f"sampler={sampler!r} is not accepted; known samplers: {', '.join(SAMPLERS)}")
-            sampler = SAMPLERS[sampler]()
+        sampler = make_sampler(sampler)
         if apply not in APPLY:
             raise ValueError(f"apply={apply!r} is not accepted; known: {', '.join(APPLY)}")
         names = [set(variation) for variation in self.variations]
@@ -144,9 +79,15 @@ class TaskDistribution:
             )
         self.sampler, self.apply, self.check = sampler, apply, check
         self.success_rates = np.full(len(self.variations), np.nan)
+        #: Running means of what learning progress is measured by, the newer and the older; NaN where not tried yet.
+        self.scores = np.full((2, len(self.variations)), np.nan)
 
     def __len__(self) -> int:
         return len(self.variations)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a pickled distribution; those of release 0.1 have no scores."""
+        self.__dict__.update({"scores": np.full((2, len(state["variations"])), np.nan), **state})
 
     def split(
         self, validation: float | int = 0.2, unseen: float | int = 0.2, seed: int = 0
@@ -187,7 +128,8 @@ class TaskDistribution:
         :return: for each task its index into :attr:`variations` and its variation, every callable in it replaced by a
             drawn value
         """
-        weights = self.sampler.weights(len(self), progress, self.success_rates)
+        statistics = getattr(self, self.sampler.reads)
+        weights = self.sampler.weights(len(self), progress, statistics)
         rounds, indices = weights, list[int]()
         while len(indices) < n_tasks:
             if not rounds.any():
@@ -200,15 +142,26 @@ class TaskDistribution:
             for index in indices
         ]
 
-    def record(self, index: int, success: float) -> None:
-        """Update the running success rate of a variation.
+    def record(self, index: int, success: float | None, episode_return: float | None = None) -> None:
+        """Update the running means of a variation.
+
+        Learning progress is measured by success where the environment tells it, and else by the return.
 
         :param index: of the variation
-        :param success: share of its latest episodes that succeeded, 0 to 1
+        :param success: share of its latest episodes that succeeded, 0 to 1; ``None`` where that is not known
+        :param episode_return: mean return of its latest episodes; ``None`` where that is not known
         """
-        old = self.success_rates[index]
-        smoothing = 1.0 if np.isnan(old) else self.SUCCESS_SMOOTHING
-        self.success_rates[index] = success if smoothing == 1 else old + smoothing * (success - old)
+        if success is not None:
+            self.success_rates[index] = _moved(self.success_rates[index], success, self.SUCCESS_SMOOTHING)
+        score = episode_return if success is None else success
+        if score is not None:
+            for mean, smoothing in zip(self.scores, self.SCORE_SMOOTHING, strict=True):
+                mean[index] = _moved(mean[index], score, smoothing)
+
+    @property
+    def learning_progress(self) -> NDArray[np.float64]:
+        """How far the newer running mean of every variation's score is from the older one; NaN where not tried yet."""
+        return np.abs(self.scores[0] - self.scores[1])
 
     def label(self, index: int) -> str:
         """Return a short and unique name of a variation for logs, such as ``n_discs=3``.
@@ -234,6 +187,14 @@ class TaskDistribution:
             label if len(label) <= MAX_LABEL and labels.count(label) == 1 else f"{index}:{label}"[:MAX_LABEL]
             for index, label in enumerate(labels)
         ]
+
+    def with_sampler(self, sampler: str | Mapping[str, Any] | Sampler) -> TaskDistribution:
+        """Return a distribution over the same variations that draws them in another way.
+
+        :param sampler: see :class:`TaskDistribution`
+        :raises ValueError: if it is not accepted
+        """
+        return TaskDistribution(self.variations, sampler, self.apply, self.check)
 
     def fit_to(self, env_id: str, env_kwargs: Mapping[str, Any] | None = None) -> TaskDistribution:
         """Return the distribution in the form that has an effect on an environment, which is this one as a rule.
@@ -303,12 +264,35 @@ class TaskDistribution:
 
 
 def default_tasks(env_id: str | None) -> TaskDistribution:
-    """Return the training variations of a domain, by curriculum, or the environment as it is for any other id.
+    """Return the training variations of a domain, all equally likely, or the environment as it is for any other id.
 
     :param env_id: environment id; ``None`` where it is not known
     """
     domain = find_domain(env_id)
     return TaskDistribution([{}]) if domain is None else TaskDistribution(domain.train)
+
+
+def make_tasks(
+    tasks: TaskDistribution | Mapping[str, Any] | Sequence[Mapping[str, Any]] | None,
+    sampler: str | Mapping[str, Any] | Sampler | None,
+    env_id: str | None,
+    fit: bool,
+    env_kwargs: Mapping[str, Any] | None,
+) -> TaskDistribution:
+    """Return the distribution that a training's arguments describe.
+
+    :param tasks: a distribution or what makes one; ``None`` for :func:`default_tasks`
+    :param sampler: in place of the distribution's own; ``None`` keeps that
+    :param env_id: environment id, where it is known
+    :param fit: whether it is to have the form that has an effect on this environment, see ``TaskDistribution.fit_to``
+    :param env_kwargs: constructor arguments of the environment
+    """
+    if tasks is None:
+        tasks = default_tasks(env_id)
+    tasks = tasks if isinstance(tasks, TaskDistribution) else TaskDistribution(tasks)
+    if sampler is not None:
+        tasks = tasks.with_sampler(sampler)
+    return tasks.fit_to(env_id, env_kwargs) if fit and env_id is not None else tasks
 
 
 class RemakeOnVariation(gym.Wrapper[Any, Any, Any, Any]):
@@ -345,6 +329,11 @@ def _call(env: VecEnv, row: int, method: str, *args: Any, **kwargs: Any) -> Any:
 def _name_of(env: VecEnv) -> str:
     spec = env.get_attr("spec")[0] if env.has_attr("spec") else None
     return "the environment" if spec is None else spec.id
+
+
+def _moved(old: float, new: float, smoothing: float) -> float:
+    """Return a running mean after a new value; the first value is the mean."""
+    return new if np.isnan(old) else old + smoothing * (new - old)
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -4,38 +4,32 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
 from sb3_contrib.ppo_recurrent import MlpLstmPolicy
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_progpolicy.extraction import env_id_of, extract_program, wrappers_of
 from sb3_progpolicy.interaction import program_names
-from sb3_progpolicy.normalization import NormalizingExtractor
 from sb3_progpolicy.policies import ProgrammaticActorCritic, ProgrammaticPolicy, RecurrentProgrammaticPolicy
 from sb3_progpolicy.programs.program import LEARNED_BY, Program
 from sb3_progpolicy.reptile.callback import check_reptile_arguments, start_task
 from sb3_progpolicy.reptile.checks import check_variations
+from sb3_progpolicy.reptile.samplers import Sampler
 from sb3_progpolicy.reptile.statistics import EpisodeStatistics
 from sb3_progpolicy.reptile.steps import MetaOptimizer, MetaOptimizerName, Task, begin_task
-from sb3_progpolicy.reptile.tasks import TaskDistribution, default_tasks
-from sb3_progpolicy.reptile_ppo.environments import (
-    check_persistence,
-    make_venv,
-    symmetries_of,
-    with_history,
-    with_limit,
-)
-from sb3_progpolicy.reptile_ppo.initial import initial_policy_kwargs, read_initial_program, start_from_program
+from sb3_progpolicy.reptile.tasks import TaskDistribution, make_tasks
+from sb3_progpolicy.reptile_ppo.environments import make_venv, symmetries_of, with_history, with_limit
+from sb3_progpolicy.reptile_ppo.growth import SearchMethod, begin_growth, check_search_arguments
+from sb3_progpolicy.reptile_ppo.initial import complete_policy_kwargs, read_initial_program, start_from_program
 from sb3_progpolicy.reptile_ppo.inner_loops import (
+    Begun,
     EngineName,
-    InnerLoops,
+    Learning,
     check_batch_arguments,
     inner_updates_of_batch,
     open_inner_loops,
@@ -45,17 +39,6 @@ from sb3_progpolicy.reptile_ppo.stored_ppo import StoredPPO
 from sb3_progpolicy.reptile_ppo.theta import Theta
 
 SelfReptilePPO = TypeVar("SelfReptilePPO", bound="ReptilePPO")
-
-
-@dataclass
-class _Learning:
-    """What one call of ``learn`` keeps besides the model."""
-
-    callback: BaseCallback
-    log_interval: int | None = None
-    inner_loops: InnerLoops | None = None
-    n_rollouts: int = 0
-    stopped: bool = False
 
 
 class ReptilePPO(StoredPPO):
@@ -96,6 +79,7 @@ class ReptilePPO(StoredPPO):
     :param max_grad_norm: gradients are clipped to this norm
     :param target_kl: stop the epochs of an update beyond 1.5 times this divergence; ``None`` for no limit
     :param tasks: a :class:`TaskDistribution`, or what makes one; by default the domain's training variations
+    :param sampler: how they are drawn, as in :class:`TaskDistribution`; by default as ``tasks`` says, or uniformly
     :param n_envs: number of environments to build for an id; 32 by default
     :param env_kwargs: constructor arguments for an id
     :param max_episode_steps: limit of an id's training episodes, in place of the registered one
@@ -110,11 +94,15 @@ class ReptilePPO(StoredPPO):
         this machine; ``"ray"``, on a cluster; ``"serial"``, one after another in this process. The first two need an
         environment id
     :param meta_update: ``False`` for PPO-N: tasks change, the meta-step is left out
-    :param search_fraction: share of the steps, 0 to 1, after which the program is extracted
+    :param search_method: how the number of conditions is found: ``"gradient"``, by W, as in the paper, or ``"growth"``,
+        from none on, one at a time, keeping what raises the return (:mod:`sb3_progpolicy.reptile_ppo.growth`)
+    :param search_fraction: share of the steps, 0 to 1, after which the program is extracted, or no condition is tried
+    :param growth_iterations: of growth, meta-iterations before a condition is tried, and for which it is
     :param init_program: start from this program, without a search: a ``Program``, its ``.json`` file, a run folder or
         the name of a shipped one. Soft and crisp program are equal then but close to where a condition changes, and Box
         actions have a deviation of a tenth of half their range, unless ``temperature`` and ``action_std`` say otherwise
-    :param length_coef: price on the expected number of conditions, at least 0; the higher, the shorter the programs
+    :param length_coef: price on the expected number of conditions, at least 0; the higher, the shorter the programs. In
+        growth the price of a condition, in standard deviations of the episodes' returns
     :param temperature: of the sigmoid in the soft semantics, a number or a schedule of the remaining progress; ``None``
         leaves it as the policy has it
     :param action_temperature: what discrete actions' logits are divided by, a number or a schedule; 1 by default. An
@@ -165,6 +153,7 @@ class ReptilePPO(StoredPPO):
         *,
         target_kl: float | None = None,
         tasks: TaskDistribution | Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
+        sampler: str | Mapping[str, Any] | Sampler | None = None,
         n_envs: int | None = None,
         env_kwargs: Mapping[str, Any] | None = None,
         max_episode_steps: int | None = None,
@@ -175,7 +164,9 @@ class ReptilePPO(StoredPPO):
         meta_batch_size: int = 1,
         engine: EngineName = "local",
         meta_update: bool = True,
+        search_method: SearchMethod = "gradient",
         search_fraction: float = 0.5,
+        growth_iterations: int = 10,
         init_program: Program | str | os.PathLike[str] | None = None,
         length_coef: float = 0.005,
         temperature: float | Schedule | None = None,
@@ -194,20 +185,16 @@ class ReptilePPO(StoredPPO):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ) -> None:
-        if not 0 <= search_fraction <= 1:
-            raise ValueError(f"search_fraction={search_fraction} is not accepted; it is from 0 to 1")
         check_reptile_arguments(inner_updates, tasks_per_iteration)
         check_batch_arguments(meta_batch_size, engine)
+        check_search_arguments(search_method, search_fraction, growth_iterations)
         self.meta_batch_size, self.engine = meta_batch_size, engine
         self.env_by_id = isinstance(env, str)
         self.env_id = env if isinstance(env, str) else env_id_of(env)
         self.interaction_history = interaction_history
         self.env_kwargs, self.max_episode_steps = dict(env_kwargs or {}), max_episode_steps
         made_with = with_limit(self.env_kwargs, max_episode_steps)
-        if tasks is None:
-            tasks = default_tasks(self.env_id)
-        tasks = tasks if isinstance(tasks, TaskDistribution) else TaskDistribution(tasks)
-        self.tasks = tasks.fit_to(env, env_kwargs) if isinstance(env, str) else tasks
+        self.tasks = make_tasks(tasks, sampler, self.env_id, self.env_by_id, env_kwargs)
         venv = None
         if env is not None:
             remade = self.tasks.apply == "constructor"
@@ -220,28 +207,22 @@ class ReptilePPO(StoredPPO):
             learning_rate = 2e-2 if learns_program else 3e-4
         if normalize_observations is None:
             normalize_observations = learns_program and init_program is None
-        policy_kwargs, self.symmetric = dict(policy_kwargs or {}), symmetric
-        check_persistence(policy_kwargs, interaction_history)
+        self._initial_program, self.learned_by = read_initial_program(init_program), LEARNED_BY[0]
+        self.symmetric, policy_kwargs = symmetric, dict(policy_kwargs or {})
         if symmetric and "symmetries" not in policy_kwargs:
             policy_kwargs["symmetries"] = symmetries_of(self.env_id, venv)
-        if normalize_observations:
-            policy_kwargs.setdefault("features_extractor_class", NormalizingExtractor)
-        initial = read_initial_program(init_program)
-        if initial is not None:
-            policy_kwargs = initial_policy_kwargs(initial, policy_class, policy_kwargs)
-        self._initial_program, self.learned_by = initial, LEARNED_BY[0]
-        self.inner_updates, self.tasks_per_iteration = inner_updates, tasks_per_iteration
-        self.meta_learning_rate = meta_learning_rate
-        self.meta_optimizer, self.meta_update = meta_optimizer, meta_update
-        self.search_fraction = search_fraction
+        policy_kwargs = complete_policy_kwargs(
+            policy_kwargs, policy_class, self._initial_program, normalize_observations, interaction_history
+        )
+        self.inner_updates, self.tasks_per_iteration, self.meta_iteration = inner_updates, tasks_per_iteration, 0
+        self.meta_optimizer, self.meta_update, self.meta_learning_rate = meta_optimizer, meta_update, meta_learning_rate
+        self.search_method, self.search_fraction = search_method, search_fraction
+        self.growth_iterations = growth_iterations
         self.normalize_observations = normalize_observations
-        self.input_names: tuple[str, ...] | None = None
-        self.output_names: tuple[str, ...] | None = None
-        self.wrappers: tuple[str, ...] = ()
-        if venv is not None:
-            self.input_names, self.output_names = program_names(venv)
-            self.wrappers = wrappers_of(venv)
-        self.meta_iteration = 0
+        names = (None, None) if venv is None else program_names(venv)
+        self.input_names: tuple[str, ...] | None = names[0]
+        self.output_names: tuple[str, ...] | None = names[1]
+        self.wrappers: tuple[str, ...] = () if venv is None else wrappers_of(venv)
         super().__init__(
             policy,
             venv,
@@ -278,6 +259,7 @@ class ReptilePPO(StoredPPO):
         if self._initial_program is not None:
             self.learned_by = start_from_program(self, self._initial_program)
             self._initial_program = None
+        self.growth = begin_growth(self) if self.search_method == "growth" else None
         self._statistics: EpisodeStatistics | None = None
         self.outer_optimizer = MetaOptimizer(self.meta_optimizer)
 
@@ -302,7 +284,7 @@ class ReptilePPO(StoredPPO):
         self._update_current_progress_remaining(self.num_timesteps, max(1, total_timesteps))
         check_variations(self.tasks, self.env)
         with open_inner_loops(self) as inner_loops:
-            learning = _Learning(callback, log_interval, inner_loops)
+            learning = Learning(callback, log_interval, inner_loops)
             callback.on_training_start(locals(), globals())
             while self._goes_on(learning) and self._search_goes_on():  # line 3
                 self._meta_iterate(learning)  # lines 4-8
@@ -313,34 +295,45 @@ class ReptilePPO(StoredPPO):
             callback.on_training_end()
         return self
 
-    def _meta_iterate(self, learning: _Learning) -> None:
+    def _meta_iterate(self, learning: Learning) -> None:
         """Make one meta-iteration: a task, inner updates on it, and a step of the initial parameters."""
-        if self.meta_batch_size == 1:
-            theta, task, rng = self._begin_task()  # lines 4 and 12
-            self._inner_updates(task, rng, learning)  # theta becomes theta_hat: lines 5-7 and 13-15
+        if self.growth is not None and self.growth.goes_on(self):
+            self.growth.meta_iterate(self, learning)
         else:
-            theta = inner_updates_of_batch(self, learning)
+            self._reptile_step(self._begin_tasks(), learning)
         self.meta_iteration += 1
         self.logger.record("reptile/meta_iteration", self.meta_iteration)
+
+    def _reptile_step(self, begun: Sequence[Begun], learning: Learning) -> None:
+        """Make the inner updates of tasks, and the step of the initial parameters."""
+        theta = [parameter.detach().clone() for parameter in self.policy.parameters()]
+        if self.meta_batch_size == 1:
+            self._inner_updates(*begun[0], learning)  # theta becomes theta_hat: lines 5-7 and 13-15
+        else:
+            inner_updates_of_batch(self, begun, learning)
         if self.meta_update:
             beta = FloatSchedule(self.meta_learning_rate)(self._current_progress_remaining)
             norm = self.outer_optimizer.step(self.policy.parameters(), theta, beta)  # lines 8 and 16
             self.logger.record("reptile/meta_learning_rate", beta)
             self.logger.record("reptile/meta_step_norm", norm)
 
-    def _begin_task(self, replica: int = 0) -> tuple[list[th.Tensor], Task, np.random.Generator]:
-        batched = self.meta_batch_size > 1  # then nothing random may be left to where an inner loop is made
+    def _begin_tasks(self) -> list[Begun]:
+        """Draw what a meta-iteration trains on: a task for every inner loop (lines 4 and 12)."""
+        return [self._begin_task(replica) for replica in range(self.meta_batch_size)]
+
+    def _begin_task(self, replica: int, n_tasks: int | None = None) -> Begun:
+        repeated = self.meta_batch_size > 1 or self.growth is not None  # in another process, or with another program
         return begin_task(
-            self.policy.parameters(),
+            (),
             self.tasks,
             self.n_envs,
-            n_tasks=self.tasks_per_iteration,
+            n_tasks=n_tasks or self.tasks_per_iteration,
             number=self.meta_iteration,
             progress=1 - self._current_progress_remaining,
-            seed=int(self.rng.integers(2**31)) if batched and self.seed is None else self.seed,
+            seed=int(self.rng.integers(2**31)) if repeated and self.seed is None else self.seed,
             rng=self.rng,
             replica=replica,
-        )
+        )[1:]
 
     def inner_loop(self, theta: Theta, task: Task, rng: np.random.Generator) -> Theta:
         """Make the inner updates of one task: ``theta`` becomes ``theta_hat`` (lines 5-7).
@@ -356,10 +349,10 @@ class ReptilePPO(StoredPPO):
         if self.ep_info_buffer is None or not hasattr(self, "_logger"):
             self._setup_learn(theta.total_timesteps)
         theta.put_into(self)
-        self._inner_updates(task, rng, _Learning(self._init_callback(None)))
+        self._inner_updates(task, rng, Learning(self._init_callback(None)))
         return Theta.of(self)
 
-    def _inner_updates(self, task: Task, rng: np.random.Generator, learning: _Learning) -> None:
+    def _inner_updates(self, task: Task, rng: np.random.Generator, learning: Learning) -> None:
         """Make ``inner_updates`` times a rollout and an update on a task, from the parameters that the model holds."""
         self.rng = rng
         if self.reward_scaler is not None:
@@ -382,10 +375,12 @@ class ReptilePPO(StoredPPO):
             if self.num_timesteps >= self._total_timesteps:
                 break
 
-    def _goes_on(self, learning: _Learning) -> bool:
+    def _goes_on(self, learning: Learning) -> bool:
         return self.num_timesteps < self._total_timesteps and not learning.stopped
 
     def _search_goes_on(self) -> bool:
+        if self.growth is not None:
+            return self.growth.goes_on(self)
         searching = self.search is not None and self.search.searching
         return searching and 1 - self._current_progress_remaining < self.search_fraction
 

@@ -90,16 +90,3 @@ def symmetries_of(env_id: str | None, venv: VecEnv | None) -> list[dict[str, Any
     if not declared:
         raise ValueError(f"symmetric=True is not accepted; {env_id or 'the environment'} declares no symmetries")
     return [as_data(symmetry) for symmetry in declared]
-
-
-def check_persistence(policy_kwargs: Mapping[str, Any], interaction_history: bool) -> None:
-    """Raise ``ValueError`` if a policy is to favour its previous action but does not see it.
-
-    :param policy_kwargs: of the policy
-    :param interaction_history: whether the history is appended to observations
-    """
-    if policy_kwargs.get("persistence_init") and not interaction_history:
-        raise ValueError(
-            f"persistence_init={policy_kwargs['persistence_init']} is not accepted with interaction_history=False; the "
-            "policy then does not see its previous action"
-        )

@@ -74,6 +74,33 @@ def _branches(program: ProgramData) -> list[IfThenElse]:
     return branches
 
 
+def complete_policy_kwargs(
+    given: Mapping[str, Any],
+    policy: type[BasePolicy],
+    program: Program | None,
+    normalize_observations: bool,
+    interaction_history: bool,
+) -> dict[str, Any]:
+    """Return the arguments of a new model's policy: the user's and those that the model's own arguments ask for.
+
+    :param given: the user's ``policy_kwargs``
+    :param policy: class of the policy
+    :param program: from :func:`read_initial_program`
+    :param normalize_observations: whether the policy normalises what it reads
+    :param interaction_history: whether the history is appended to observations
+    :raises ValueError: if they do not go together
+    """
+    if given.get("persistence_init") and not interaction_history:
+        raise ValueError(
+            f"persistence_init={given['persistence_init']} is not accepted with interaction_history=False; the policy "
+            "then does not see its previous action"
+        )
+    completed = dict(given)
+    if normalize_observations:
+        completed.setdefault("features_extractor_class", NormalizingExtractor)
+    return completed if program is None else initial_policy_kwargs(program, policy, completed)
+
+
 def initial_policy_kwargs(program: Program, policy: type[BasePolicy], given: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of the policy that can be the program; those given are kept, but for too small a depth.
 

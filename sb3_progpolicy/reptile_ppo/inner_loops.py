@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import cloudpickle
 import numpy as np
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
 from sb3_progpolicy.cluster import join_cluster
@@ -36,6 +37,17 @@ if TYPE_CHECKING:
 
 EngineName = Literal["serial", "local", "ray"]
 Begun = tuple[Task, np.random.Generator]  # what ``begin_task`` gives
+
+
+@dataclass
+class Learning:
+    """What one call of ``learn`` keeps besides the model."""
+
+    callback: BaseCallback
+    log_interval: int | None = None
+    inner_loops: InnerLoops | None = None
+    n_rollouts: int = 0
+    stopped: bool = False
 
 
 def check_batch_arguments(meta_batch_size: int, engine: str) -> None:
@@ -85,7 +97,7 @@ class _Result:
 
     theta: Theta
     n_updates: int
-    successes: Sequence[tuple[int, float]]
+    recorded: Sequence[tuple[int, float | None, float | None]]
     episodes: Sequence[dict[str, Any]]
     episode_successes: Sequence[Any]
     logged: dict[str, Any]
@@ -93,8 +105,8 @@ class _Result:
     def take_over(self, model: ReptilePPO) -> None:
         """Let a model's logs be as if it had made the inner loop."""
         model._n_updates += self.n_updates
-        for index, success in self.successes:
-            model.tasks.record(index, success)
+        for index, success, episode_return in self.recorded:
+            model.tasks.record(index, success, episode_return)
         assert model.ep_info_buffer is not None
         assert model.ep_success_buffer is not None
         model.ep_info_buffer.extend(self.episodes)
@@ -306,17 +318,17 @@ def _mean(states: Sequence[dict[str, Any]], last: dict[str, Any]) -> dict[str, A
     return mean
 
 
-def inner_updates_of_batch(model: Any, learning: Any) -> list[th.Tensor]:
-    """Let several inner loops start from theta and take over the mean of their results; return theta.
+def inner_updates_of_batch(model: Any, begun: Sequence[Begun], learning: Learning) -> None:
+    """Let several inner loops start from theta and take over the mean of their results.
 
     :param model: a ReptilePPO
+    :param begun: their tasks, each with its source of randomness
     :param learning: what its ``learn`` keeps
     """
     learning.callback.on_rollout_start()
     assert learning.inner_loops is not None
-    begun = [model._begin_task(replica) for replica in range(model.meta_batch_size)]
     theta = Theta.of(model)
-    results = learning.inner_loops.run(theta, [(task, rng) for _, task, rng in begun])
+    results = learning.inner_loops.run(theta, begun)
     mean_of(results, theta).put_into(model)
     for _ in range((model.num_timesteps - theta.num_timesteps) // model.n_envs):
         if not learning.callback.on_step():
@@ -327,4 +339,3 @@ def inner_updates_of_batch(model: Any, learning: Any) -> list[th.Tensor]:
     interval = learning.log_interval
     if interval is not None and learning.n_rollouts // interval > before // interval:
         model.dump_logs(learning.n_rollouts)
-    return begun[0][0]

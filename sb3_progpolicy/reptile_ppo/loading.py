@@ -18,10 +18,20 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces
 
+from sb3_progpolicy.reptile.samplers import SAMPLERS
 from sb3_progpolicy.reptile.steps import META_OPTIMIZERS
-from sb3_progpolicy.reptile.tasks import SAMPLERS, TaskDistribution
+from sb3_progpolicy.reptile.tasks import TaskDistribution
 from sb3_progpolicy.reptile_ppo.environments import make_venv, with_history
-from sb3_progpolicy.reptile_ppo.saving import ARGUMENTS, OPTIMIZERS, ROLLOUT, STATE, SavedModel, is_sb3_file, read_model
+from sb3_progpolicy.reptile_ppo.saving import (
+    ARGUMENTS,
+    ARM,
+    OPTIMIZERS,
+    ROLLOUT,
+    STATE,
+    SavedModel,
+    is_sb3_file,
+    read_model,
+)
 from sb3_progpolicy.reptile_ppo.values import ModelFormatError
 
 if TYPE_CHECKING:
@@ -30,8 +40,10 @@ if TYPE_CHECKING:
 #: What loading cannot change, because parameters or statistics depend on it.
 FIXED = (
     *("policy", "policy_kwargs", "meta_optimizer"),
-    *("interaction_history", "normalize_observations", "scale_rewards", "symmetric"),
+    *("interaction_history", "normalize_observations", "scale_rewards", "symmetric", "search_method"),
 )
+#: What else loading can change; the number of environments is among the state, the sampler is that of the tasks.
+_NOT_STORED = ("n_envs", "sampler")
 #: Tensors of a policy that came later: files without them mean what a new policy has.
 _LATER = ("module.action_temperature",)
 MAX_ENVS, MAX_ROLLOUT, MAX_PARAMETERS = 2**16, 2**28, 10**7
@@ -64,8 +76,8 @@ def load_model(
             )
         return _load_pickles(cls, path, env, device, custom_objects, force_reset, changes)
     changes = {**{name: value for name, value in custom_objects.items() if name in ARGUMENTS}, **changes}
-    if unknown := sorted(set(changes) - set(ARGUMENTS) - {"n_envs"}):
-        raise ValueError(f"{unknown[0]}= is not accepted; accepted: {', '.join((*ARGUMENTS, 'n_envs'))}")
+    if unknown := sorted(set(changes) - set(ARGUMENTS) - set(_NOT_STORED)):
+        raise ValueError(f"{unknown[0]}= is not accepted; accepted: {', '.join((*ARGUMENTS, *_NOT_STORED))}")
     saved = read_model(path, allow_pickle, {*changes, *custom_objects})
     saved.state.update({name: value for name, value in custom_objects.items() if name in saved.state})
     for name in FIXED:
@@ -79,6 +91,9 @@ def load_model(
         model = _make(cls, saved, env, device, changes)
         _restore_state(model, saved.state)
         model.set_parameters(checked_parameters(model, saved), device=device)
+        if model.growth is not None and saved.state.get("growth") is not None:
+            arm = checked_parameters(model, saved, ARM) if saved.state["growth"]["trial_is_open"] else None
+            model.growth.restore(saved.state["growth"], arm, model)
     except _REFUSALS as error:
         raise ModelFormatError(f"{path}: no model can be made of it ({type(error).__name__}: {error})") from error
     if env is None or not force_reset:
@@ -169,11 +184,19 @@ def _tasks(data: Mapping[str, Any]) -> TaskDistribution:
         raise ModelFormatError(f"sampler={data['sampler']!r:.40} is not accepted; known: {', '.join(SAMPLERS)}")
     sampler = SAMPLERS[data["sampler"]](**data["sampler_arguments"])
     tasks = TaskDistribution(data["variations"], sampler, data["apply"], data.get("check", True))
-    rates = [np.nan if rate is None else float(rate) for rate in data["success_rates"]]
-    if len(rates) != len(tasks):
-        raise ModelFormatError(f"success_rates: {len(rates)} given for {len(tasks)} variations")
-    tasks.success_rates = np.array(rates, dtype=np.float64)
+    tasks.success_rates = _means("success_rates", data["success_rates"], len(tasks))
+    if "scores" in data:  # files of before there were any lack them
+        tasks.scores = np.array([_means("scores", means, len(tasks)) for means in data["scores"]])
+        if tasks.scores.shape != (2, len(tasks)):
+            raise ModelFormatError(f"scores: {len(data['scores'])} rows given; 2 are expected")
     return tasks
+
+
+def _means(name: str, given: Any, n_variations: int) -> NDArray[np.float64]:
+    means = np.array([np.nan if mean is None else float(mean) for mean in given], dtype=np.float64)
+    if len(means) != n_variations or np.isinf(means).any():
+        raise ModelFormatError(f"{name}: {len(means)} finite numbers or null expected for {n_variations} variations")
+    return means
 
 
 def _restore_state(model: ReptilePPO, state: Mapping[str, Any]) -> None:
@@ -188,9 +211,7 @@ def _restore_state(model: ReptilePPO, state: Mapping[str, Any]) -> None:
     if "rng" in state:
         model.rng.bit_generator.state = state["rng"]
     if model.reward_scaler is not None and state.get("reward_statistics") is not None:
-        mean, variance, count = map(np.float64, state["reward_statistics"])
-        statistics = model.reward_scaler.statistics
-        statistics.mean, statistics.var, statistics.count = mean, variance, float(count)
+        model.reward_scaler.restore(state["reward_statistics"])
     window = model._stats_window_size
     if state.get("episodes") is not None:
         model.ep_info_buffer = deque((dict(zip("rlt", e, strict=True)) for e in state["episodes"]), maxlen=window)
@@ -210,35 +231,37 @@ def parameters_of(model: Any, path_or_parameters: Any) -> Any:
     return renamed
 
 
-def checked_parameters(model: ReptilePPO, saved: SavedModel) -> dict[str, Any]:
+def checked_parameters(model: ReptilePPO, saved: SavedModel, owner: str = "") -> dict[str, Any]:
     """Return the parameters and optimizers of a file, in the form of ``set_parameters``.
 
     :param model: which they are for
     :param saved: the file
+    :param owner: ``""`` for the model's own, :data:`ARM` for those of the program that growth is trying
     :raises ModelFormatError: if they do not fit, or are not finite
     """
-    policy, expected_policy = saved.under("policy"), model.policy.state_dict()
+    policy, expected_policy = saved.under(f"{owner}policy"), model.policy.state_dict()
     absent = {name: expected_policy[name].cpu().numpy() for name in _LATER if name in expected_policy}
     policy = {**{name: array for name, array in absent.items() if name not in policy}, **policy}
     _check_tensors("policy", policy, expected_policy)
     parameters: dict[str, Any] = {"policy": _to_torch(policy)}
     outer = META_OPTIMIZERS[model.meta_optimizer](model.policy.parameters(), lr=1.0)  # type: ignore[call-arg]
     for name, optimizer in zip(OPTIMIZERS, (model.policy.optimizer, outer), strict=True):
-        groups = saved.optimizers.get(name)
+        groups = saved.optimizers.get(f"{owner}{name}")
         if groups == [] and name == "outer_optimizer":  # before the first meta-step
             parameters[name] = {}
             continue
         expected = _after_a_step(optimizer)
         _check_groups(name, groups, expected["param_groups"])
         moments: dict[int, Any] = {}
-        for key, tensor in saved.under(name).items():
+        for key, tensor in saved.under(f"{owner}{name}").items():
             index, _, of = key.partition("/")
             moments.setdefault(int(index), {})[of] = tensor
         for number, tensors in moments.items():
             _check_tensors(f"{name}: parameter {number}", tensors, expected["state"][number])
         state = {number: _to_torch(tensors) for number, tensors in moments.items()}
         parameters[name] = {"state": state, "param_groups": groups}
-    known = len(saved.under("policy")) + sum(len(saved.under(name)) for name in (*OPTIMIZERS, "rollout"))
+    owners = (*("policy", *OPTIMIZERS, "rollout"), *(ARM + name for name in ("policy", *OPTIMIZERS)))
+    known = sum(len(saved.under(name)) for name in owners)
     if known != len(saved.tensors):
         raise ModelFormatError(f"{len(saved.tensors) - known} unknown tensors")
     return parameters

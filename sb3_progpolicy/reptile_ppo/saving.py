@@ -27,7 +27,8 @@ from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, Line
 
 from sb3_progpolicy.programs.files import write_atomically
 from sb3_progpolicy.programs.program import LEARNED_BY
-from sb3_progpolicy.reptile.tasks import SAMPLERS, TaskDistribution
+from sb3_progpolicy.reptile.samplers import SAMPLERS
+from sb3_progpolicy.reptile.tasks import TaskDistribution
 from sb3_progpolicy.reptile_ppo.values import ModelFormatError, NotDataError, from_data, to_data
 
 FORMAT, VERSION = "sb3-progpolicy model", 1
@@ -101,7 +102,9 @@ ARGUMENTS: Mapping[str, Check] = {
     "meta_learning_rate": _schedule,
     "meta_optimizer": _text,
     "meta_update": _flag,
+    "search_method": _text,
     "search_fraction": _number,
+    "growth_iterations": _count,
     "length_coef": _number,
     "temperature": _optional(_schedule),
     "action_temperature": _optional(_schedule),
@@ -135,9 +138,12 @@ STATE: Mapping[str, Check] = {
     "rng": _mapping,
     "reward_statistics": _optional(_all(_number)),
     "episodes": _optional(_all(_all(_number))),
+    "growth": _optional(_mapping),
     "successes": _optional(_all(lambda value: _flag(value) or _number(value))),
 }
 OPTIMIZERS = ("policy.optimizer", "outer_optimizer")
+#: Before the names of what belongs to the program that growth is trying.
+ARM = "growth/"
 ROLLOUT = ("_last_obs", "_last_episode_starts")
 
 
@@ -205,7 +211,13 @@ def write_model(
             "SB3's schedules instead, or pickle it with save(..., allow_pickle=True)"
         )
     parameters = model.get_parameters()
-    document["optimizers"] = {name: to_data(parameters[name].get("param_groups", [])) for name in OPTIMIZERS}
+    if model.growth is not None:
+        parameters |= {ARM + name: values for name, values in model.growth.parameters().items()}
+    document["optimizers"] = {
+        name: to_data(values.get("param_groups", []))
+        for name, values in parameters.items()
+        if name.removeprefix(ARM) in OPTIMIZERS
+    }
     entries[TENSORS] = safetensors.numpy.save(_tensors(model, parameters))
     content = _zip({DOCUMENT: json.dumps(document, allow_nan=False).encode(), **entries})
     if isinstance(path, (str, os.PathLike)):
@@ -238,13 +250,17 @@ def _tasks_to_plain(tasks: TaskDistribution) -> Any:
         "sampler_arguments": dict(vars(tasks.sampler)),
         "check": tasks.check,
         "apply": tasks.apply,
-        "success_rates": [None if np.isnan(rate) else float(rate) for rate in tasks.success_rates],
+        "success_rates": _with_none(tasks.success_rates),
+        "scores": [_with_none(means) for means in tasks.scores],
     }
 
 
+def _with_none(means: NDArray[np.float64]) -> list[float | None]:
+    return [None if np.isnan(mean) else float(mean) for mean in means]
+
+
 def _state(model: Any) -> dict[str, Any]:
-    scaler, episodes, successes = model.reward_scaler, model.ep_info_buffer, model.ep_success_buffer
-    statistics = None if scaler is None else scaler.statistics
+    episodes, successes = model.ep_info_buffer, model.ep_success_buffer
     return {
         "env_id": model.env_id,
         "n_envs": model.n_envs,
@@ -260,17 +276,21 @@ def _state(model: Any) -> dict[str, Any]:
         "n_updates": model._n_updates,
         "meta_iteration": model.meta_iteration,
         "rng": model.rng.bit_generator.state,
-        "reward_statistics": statistics and [float(x) for x in (statistics.mean, statistics.var, statistics.count)],
+        "reward_statistics": model.reward_scaler and model.reward_scaler.state(),
+        "growth": None if model.growth is None else model.growth.state(),
         "episodes": None if episodes is None else [[episode[key] for key in "rlt"] for episode in episodes],
         "successes": None if successes is None else list(successes),
     }
 
 
 def _tensors(model: Any, parameters: Mapping[str, Any]) -> Tensors:
-    tensors = {f"policy/{name}": tensor for name, tensor in parameters["policy"].items()}
-    for optimizer in OPTIMIZERS:
-        for index, values in parameters[optimizer].get("state", {}).items():
-            tensors |= {f"{optimizer}/{index}/{name}": th.as_tensor(value) for name, value in values.items()}
+    tensors: dict[str, th.Tensor] = {}
+    for owner, held in parameters.items():
+        if owner.removeprefix(ARM) == "policy":
+            tensors |= {f"{owner}/{name}": tensor for name, tensor in held.items()}
+            continue
+        for index, values in held.get("state", {}).items():
+            tensors |= {f"{owner}/{index}/{name}": th.as_tensor(value) for name, value in values.items()}
     arrays = {name: np.ascontiguousarray(tensor.detach().cpu().numpy()) for name, tensor in tensors.items()}
     arrays = {name: array.reshape(tensors[name].shape) for name, array in arrays.items()}
     for name, array in arrays.items():

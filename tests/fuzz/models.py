@@ -43,8 +43,12 @@ def make_model() -> ReptilePPO:
     tasks = TaskDistribution({"n_discs": [1, 2]}, sampler="failure")
     model = ReptilePPO("ProgPolicy", "Hanoi-v0", n_envs=2, n_steps=8, seed=0, tasks=tasks, meta_optimizer="adam",
                        inner_updates=1, normalize_observations=True, scale_rewards=True,
+                       search_method="growth", growth_iterations=3,
                        policy_kwargs={"net_arch": [8], "activation_fn": th.nn.Tanh})  # fmt: skip
-    return model.learn(64)
+    model.learn(1100)
+    assert model.growth is not None
+    assert model.growth.arm is not None, "a trial is open"
+    return model
 
 
 def write(entries: list[tuple[str, bytes]], compression: int = zipfile.ZIP_STORED) -> bytes:
