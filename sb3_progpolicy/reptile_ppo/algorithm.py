@@ -211,14 +211,12 @@ class ReptilePPO(StoredPPO):
         self.symmetric, policy_kwargs = symmetric, dict(policy_kwargs or {})
         if symmetric and "symmetries" not in policy_kwargs:
             policy_kwargs["symmetries"] = symmetries_of(self.env_id, venv)
-        policy_kwargs = complete_policy_kwargs(
-            policy_kwargs, policy_class, self._initial_program, normalize_observations, interaction_history
-        )
+        about = (self._initial_program, normalize_observations, interaction_history)
+        policy_kwargs = complete_policy_kwargs(policy_kwargs, policy_class, *about)
         self.inner_updates, self.tasks_per_iteration, self.meta_iteration = inner_updates, tasks_per_iteration, 0
         self.meta_optimizer, self.meta_update, self.meta_learning_rate = meta_optimizer, meta_update, meta_learning_rate
         self.search_method, self.search_fraction = search_method, search_fraction
-        self.growth_iterations = growth_iterations
-        self.normalize_observations = normalize_observations
+        self.growth_iterations, self.normalize_observations = growth_iterations, normalize_observations
         names = (None, None) if venv is None else program_names(venv)
         self.input_names: tuple[str, ...] | None = names[0]
         self.output_names: tuple[str, ...] | None = names[1]
