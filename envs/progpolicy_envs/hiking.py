@@ -72,7 +72,8 @@ _SECTIONS = {
 
         ## Starting State
         The hiker stands on the map's start, the stars lie on different pathway cells drawn with the environment's
-        generator. With ``layout="random"`` each episode also draws one of 1024 generated maps.
+        generator. With ``layout="random"`` each episode also draws one of 1024 generated maps; with
+        ``layout="practice"`` one of 1024 others, to train on.
         With ``n_done`` above 0 so many stars have been collected, and the hiker stands where the last of them was.
         ``env.reset(options={"hiker": [0, 1], "stars": [[0, 3], [2, 2]]})`` gives the places instead, as rows and
         columns; of ``n_stars`` stars those that are left out have been collected.
@@ -92,7 +93,8 @@ _SECTIONS = {
         | Parameter   | Values                                                          | Default | Meaning            |
         |-------------|-----------------------------------------------------------------|---------|--------------------|
         | n_stars     | 1 to 12                                                         | 3       | number of stars    |
-        | layout      | valley, spiral, comb, fork, lakeside, random or a map as a text | valley  | the map            |
+        | layout      | valley, spiral, comb, fork, lakeside, random, practice, or a    | valley  | the map            |
+        |             | map as a text                                                   |         |                    |
         | n_done      | 0 to 11, fewer than n_stars, or "random": drawn for every       | 0       | stars that have    |
         |             | episode. Not in ``context``                                     |         | been collected     |
 

@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 
 N_ROWS, N_COLUMNS = 8, 10
 N_CELLS = N_ROWS * N_COLUMNS
-N_RANDOM_LAYOUTS = 1024
+N_RANDOM_LAYOUTS = 1024  # of each family
+#: The families of random maps, and the number of the first of each. No map is in both, so that what has been trained on
+#: the one can be tested on the other.
+RANDOM_LAYOUTS = {"random": 0, "practice": N_RANDOM_LAYOUTS}
 #: Row and column change of each direction, clockwise from north, so that the next index is the right-hand turn.
 DIRECTIONS = {"north": (-1, 0), "east": (0, 1), "south": (1, 0), "west": (0, -1)}
 PATH, ROCK, WATER, START, STAR = ".", "#", "~", "H", "*"
@@ -186,18 +189,27 @@ def read_layout(rows: tuple[str, ...]) -> Layout:
     return layout
 
 
-@lru_cache(maxsize=N_RANDOM_LAYOUTS)
+def draw_layout(family: str, generator: np.random.Generator) -> Layout:
+    """Draw one of a family of random maps.
+
+    :param family: ``"random"`` or ``"practice"``
+    :param generator: one number is drawn from it
+    """
+    return random_layout(RANDOM_LAYOUTS[family] + int(generator.integers(N_RANDOM_LAYOUTS)))
+
+
+@lru_cache(maxsize=len(RANDOM_LAYOUTS) * N_RANDOM_LAYOUTS)
 def random_layout(number: int) -> Layout:
     """Return random map ``number``: connected and tree-like, 30 to 40 pathway cells, always the same for a number.
 
     A pathway grows cell by cell, mostly onwards from its end and sometimes from anywhere, and only into cells that
     touch it on one side; so it bends, forks and ends, and never closes a ring.
 
-    :param number: 0 to 1023
+    :param number: 0 to 1023 for ``layout="random"``, 1024 to 2047 for ``"practice"``
     :raises ValueError: if the number is out of range
     """
-    if not 0 <= number < N_RANDOM_LAYOUTS:
-        raise ValueError(f"random map {number} does not exist; numbers are 0 to {N_RANDOM_LAYOUTS - 1}")
+    if not 0 <= number < (n_layouts := len(RANDOM_LAYOUTS) * N_RANDOM_LAYOUTS):
+        raise ValueError(f"random map {number} does not exist; numbers are 0 to {n_layouts - 1}")
     generator = np.random.default_rng(number)
     path = _grow(generator, int(generator.integers(30, 41)))
     cells = np.full(N_CELLS, ROCK)

@@ -18,14 +18,14 @@ from progpolicy_envs.layouts import (
     LAYOUTS,
     N_CELLS,
     N_COLUMNS,
-    N_RANDOM_LAYOUTS,
     N_ROWS,
     NEIGHBOURS,
     PATH,
+    RANDOM_LAYOUTS,
     STAR,
     START,
     Layout,
-    random_layout,
+    draw_layout,
     read_layout,
     split_rows,
 )
@@ -93,14 +93,19 @@ def _check_variation(variation: Variation) -> None:
     """Raise ``ValueError`` if the map has fewer places for stars than there are stars, or none is left to collect."""
     check_n_done(variation, "n_stars")
     n_stars, layout = variation["n_stars"], variation["layout"]
-    n_places = MAX_STARS if layout == RANDOM else len(named_layout(layout).star_cells)
+    n_places = MAX_STARS if layout in RANDOM_LAYOUTS else len(named_layout(layout).star_cells)
     if n_stars > n_places:
         raise ValueError(f"n_stars={n_stars} is not accepted; on this layout n_stars is at most {n_places}")
 
 
 VARIATIONS = VariationSpace(
     IntParameter("n_stars", 1, MAX_STARS, 3, "number of stars"),
-    LayoutParameter("layout", (*LAYOUTS, RANDOM), "valley", "the map; 'random' draws another one for every episode"),
+    LayoutParameter(
+        "layout",
+        (*LAYOUTS, *RANDOM_LAYOUTS),
+        "valley",
+        "the map; 'random' draws another one for every episode, 'practice' one of others",
+    ),
     n_done_parameter(MAX_STARS - 1, "stars that have been collected"),
     check=_check_variation,
     starts={
@@ -121,7 +126,7 @@ def draw_task(
     :param variation: values of ``n_stars``, ``layout`` and ``n_done``
     """
     value = variation["layout"]
-    layout = random_layout(int(generator.integers(N_RANDOM_LAYOUTS))) if value == RANDOM else named_layout(value)
+    layout = draw_layout(value, generator) if value in RANDOM_LAYOUTS else named_layout(value)
     stars = generator.permutation(layout.star_cells)[: variation["n_stars"]]
     n_done = draw_n_done(variation, "n_stars", generator)
     return len(stars), layout, stars[n_done - 1] if n_done else layout.start, stars[n_done:]
@@ -149,8 +154,8 @@ def read_state(state: Mapping[str, Any]) -> tuple[int, Layout, int, list[int]]:
     """
     n_stars, layout_name, stars = state["n_stars"], state["layout"], state["stars"]
     variation = VARIATIONS.update({}, {"n_stars": n_stars, "layout": layout_name})
-    if variation["layout"] == RANDOM:
-        raise ValueError(f"layout={RANDOM!r} is not accepted in a state; give the map as rows of text")
+    if variation["layout"] in RANDOM_LAYOUTS:
+        raise ValueError(f"layout={variation['layout']!r} is not accepted in a state; give the map as rows of text")
     layout = named_layout(variation["layout"])
     if not is_sequence(stars) or len(stars) > variation["n_stars"]:
         raise ValueError(
@@ -327,7 +332,7 @@ class PathwayVectorEnv(MapView, PlanningVectorEnv):
         """
         whole = cls.variations.update(cls.variations.defaults, variation)
         n_done = whole.get("n_done", 0)
-        if any_state or RANDOM in (whole["layout"], n_done):
+        if any_state or whole["layout"] in RANDOM_LAYOUTS or n_done == RANDOM:
             return super().count_starts(variation, any_state)
         n_cells, n_left = len(named_layout(whole["layout"]).star_cells), whole["n_stars"] - n_done
         return math.comb(n_cells, n_left) * (n_cells - n_left if n_done else 1)

@@ -79,9 +79,22 @@ def test_random_maps_differ_and_a_number_always_gives_the_same() -> None:
     assert random_layout(17).rows == before
 
 
-@pytest.mark.parametrize("number", [-1, N_RANDOM_LAYOUTS])
+def test_maps_to_practise_on_are_none_of_the_others() -> None:
+    rows = [random_layout(number).rows for number in range(2 * N_RANDOM_LAYOUTS)]
+    assert not set(rows[:N_RANDOM_LAYOUTS]) & {*rows[N_RANDOM_LAYOUTS:], *(layout.rows for layout in LAYOUTS.values())}
+    drawn = {"random": set(), "practice": set()}
+    for family, seen in drawn.items():
+        env = HikingEgoEnv(layout=family)
+        for seed in range(50):
+            env.reset(seed=seed)
+            seen.add(tuple(env.state["layout"].split("\n")))
+    assert drawn["random"] <= set(rows[:N_RANDOM_LAYOUTS])
+    assert drawn["practice"] <= set(rows[N_RANDOM_LAYOUTS:])
+
+
+@pytest.mark.parametrize("number", [-1, 2 * N_RANDOM_LAYOUTS])
 def test_random_map_number_out_of_range_is_refused(number: int) -> None:
-    with pytest.raises(ValueError, match=f"random map {number} does not exist; numbers are 0 to 1023"):
+    with pytest.raises(ValueError, match=f"random map {number} does not exist; numbers are 0 to 2047"):
         random_layout(number)
 
 
@@ -129,7 +142,7 @@ def test_plan_of_no_stars_is_empty() -> None:
     assert planner.optimal_steps(layout, layout.start, []) == 0
 
 
-@pytest.mark.parametrize(("n_stars", "layout"), list(product([1, 5, 12], [*LAYOUTS, "random"])))
+@pytest.mark.parametrize(("n_stars", "layout"), list(product([1, 5, 12], [*LAYOUTS, "random", "practice"])))
 def test_environment_takes_the_plan_and_ends_at_its_last_step_only(n_stars: int, layout: str) -> None:
     env = HikingEnv(n_stars=n_stars, layout=layout)
     _, info = env.reset(seed=n_stars)
