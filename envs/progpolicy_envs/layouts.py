@@ -208,7 +208,8 @@ def random_layout(number: int) -> Layout:
     :param number: 0 to 1023 for ``layout="random"``, 1024 to 2047 for ``"practice"``
     :raises ValueError: if the number is out of range
     """
-    if not 0 <= number < (n_layouts := len(RANDOM_LAYOUTS) * N_RANDOM_LAYOUTS):
+    n_layouts = len(RANDOM_LAYOUTS) * N_RANDOM_LAYOUTS
+    if not 0 <= number < n_layouts:
         raise ValueError(f"random map {number} does not exist; numbers are 0 to {n_layouts - 1}")
     generator = np.random.default_rng(number)
     path = _grow(generator, int(generator.integers(30, 41)))
