@@ -135,16 +135,14 @@ DOMAINS: dict[str, Domain] = {
             validation=({"n_stars": 5},),
             unseen=tuple({"n_stars": n_stars} for n_stars in (6, 7, 8, 9, 10)),
         ),
-        # From the hiker's point of view: what is learned on some maps is tested on others.
+        # From the hiker's point of view: what is learned on generated maps is tested on others. On a few maps the window
+        # tells where the hiker is, and what is learned is these maps by heart.
         Domain(
             id="HikingEgo-v0",
             entry_point="progpolicy_envs.hiking:HikingEgoEnv",
             vector_entry_point="progpolicy_envs.hiking:HikingEgoVectorEnv",
             size="n_stars",
-            train=tuple(
-                {"n_stars": n_stars, "layout": layout}
-                for n_stars, layout in product((1, 2, 3, 4), ("valley", "comb", "fork"))
-            ),
+            train=tuple({"n_stars": n_stars, "layout": "practice"} for n_stars in (1, 2, 3, 4)),
             validation=tuple({"n_stars": 5, "layout": layout} for layout in ("valley", "comb", "fork")),
             unseen=tuple(
                 {"n_stars": n_stars, "layout": layout}
