@@ -135,8 +135,8 @@ DOMAINS: dict[str, Domain] = {
             validation=({"n_stars": 5},),
             unseen=tuple({"n_stars": n_stars} for n_stars in (6, 7, 8, 9, 10)),
         ),
-        # From the hiker's point of view: what is learned on generated maps is tested on others. On a few maps the window
-        # tells where the hiker is, and what is learned is these maps by heart.
+        # From the hiker's point of view: what is learned on generated maps is tested on others. On a few maps the
+        # window tells where the hiker is, and what is learned is these maps by heart.
         Domain(
             id="HikingEgo-v0",
             entry_point="progpolicy_envs.hiking:HikingEgoEnv",
