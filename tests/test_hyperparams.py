@@ -73,6 +73,12 @@ def test_timeouts_are_terminal_where_a_file_or_the_command_line_says_so():
         assert (model.timeouts, model.max_episode_steps) == ("terminal", 9)
 
 
+def test_entry_gives_arguments_of_the_environment_which_the_command_line_can_change():
+    assert make_config("reptile_ppo", "PandaPush-v0", 0).env_kwargs == {"reward_type": "potential"}
+    changed = make_config("reptile_ppo", "PandaPush-v0", 0, env_kwargs={"reward_type": "dense", "n_objects": 2})
+    assert changed.env_kwargs == {"reward_type": "dense", "n_objects": 2}
+
+
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [

@@ -102,7 +102,7 @@ def complete_policy_kwargs(
 
 
 def initial_policy_kwargs(program: Program, policy: type[BasePolicy], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of the policy that can be the program; those given are kept, but for too small a depth.
+    """Return the arguments of the policy that can be the program; those given are kept, but for how many conditions.
 
     :param program: from :func:`read_initial_program`
     :param policy: class of the policy
@@ -124,6 +124,9 @@ def initial_policy_kwargs(program: Program, policy: type[BasePolicy], given: Map
     fitting: dict[str, Any] = {"temperature": _temperature(program)}
     if shape is not None:
         fitting |= {"cell": shape[0], "condition_size": shape[1]}
+    if given.get("n_conditions") is not None:  # as hyperparameters for training from the start have it
+        fitting["n_conditions"] = len(program.conditions)
+        given = {name: value for name, value in given.items() if name != "n_conditions"}
     return {**fitting, **given, "depth": max(len(program.conditions) + 1, given.get("depth", 1))}
 
 

@@ -277,3 +277,12 @@ def test_program_whose_weights_need_not_be_tied_is_refused():
         put_program(tied, load_pretrained("Hanoi-v0"))
     with pytest.raises(ValueError, match="init_program is not accepted with symmetric=True"):
         make(env="Hanoi-v0", init_program="Hanoi-v0", symmetric=True)
+
+
+def test_number_of_conditions_is_that_of_the_program():
+    program = load_pretrained("PandaStack-v0")
+    kwargs = {"n_conditions": 5, "cell": "affine"}
+    model = make(
+        "PRLPolicy", "PandaStack-v0", n_envs=1, interaction_history=False, init_program=program, policy_kwargs=kwargs
+    )
+    assert len(model.program().conditions) == len(program.conditions) != 5
