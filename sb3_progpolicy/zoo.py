@@ -72,6 +72,9 @@ def _translated(place: str, entry: Mapping[str, Any]) -> dict[str, Any]:
         if str(entry.get(name, "")).count("_") > 1:
             raise ValueError(f"{place}: {name}={entry[name]!r} has no form in the zoo, whose schedules fall to 0")
     translated = {name: value for name, value in entry.items() if value is not None}
+    limit = translated.pop("max_episode_steps", None)
+    if limit is not None:  # it makes the environments, for evaluation too
+        translated["env_kwargs"] = {**translated.get("env_kwargs", {}), "max_episode_steps": limit}
     if translated.pop("interaction_history", True):
         translated["env_wrapper"] = "sb3_progpolicy.InteractionHistory"
     return {**translated, "interaction_history": False}
