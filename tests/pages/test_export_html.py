@@ -71,9 +71,9 @@ def shipped_pages():
 PAGES = {
     **shipped_pages(),
     "a random recurrent program for Hanoi-v0": lambda: hanoi_program(3, "gru"),
-    "Hiking-v0": map_program,
-    "HikingEgo-v0": egocentric_program,
-    "PandaStack-v0": PROGRAMS["PandaStack-v0"],
+    "Hiking-v0 by hand": map_program,
+    "HikingEgo-v0 by hand": egocentric_program,
+    "PandaStack-v0 by hand": PROGRAMS["PandaStack-v0"],
 }
 
 
