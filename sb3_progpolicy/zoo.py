@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from stable_baselines3.common.utils import LinearSchedule
 
 import progpolicy_envs  # noqa: F401  registers the environments
 from sb3_progpolicy.experiment.config import parse_schedule
@@ -95,11 +96,20 @@ def _algorithm(arguments: Sequence[str]) -> str | None:
 
 
 def _reading_schedules(algorithm: type[Any]) -> type[Any]:
-    """Return an algorithm that reads those schedules which the zoo hands on as texts."""
+    """Return an algorithm that reads those schedules which the zoo hands on as texts, and the zoo's own kind.
+
+    That is no data, in which our models are saved; SB3's is.
+    """
+    from rl_zoo3.utils import SimpleLinearSchedule
+
+    def read(name: str, value: Any) -> Any:
+        if isinstance(value, SimpleLinearSchedule):
+            return LinearSchedule(value.initial_value, 0.0, 1.0)
+        return parse_schedule(name, value)
 
     class WithSchedules(algorithm):
         def __init__(self, *arguments: Any, **options: Any) -> None:
-            super().__init__(*arguments, **{name: parse_schedule(name, value) for name, value in options.items()})
+            super().__init__(*arguments, **{name: read(name, value) for name, value in options.items()})
 
     WithSchedules.__name__ = WithSchedules.__qualname__ = algorithm.__name__
     return WithSchedules

@@ -5,10 +5,13 @@ import sys
 
 import pytest
 import yaml
+from rl_zoo3 import ALGOS
+from rl_zoo3 import utils as zoo_utils
 
+from sb3_progpolicy import ReptilePPO
 from sb3_progpolicy.experiment.methods import METHODS
 from sb3_progpolicy.hyperparams import load_entries
-from sb3_progpolicy.zoo import main, zoo_hyperparams
+from sb3_progpolicy.zoo import main, register, zoo_hyperparams
 
 OURS = [name for name, method in METHODS.items() if method.has_reptile]
 
@@ -49,6 +52,16 @@ def test_schedule_that_the_zoo_has_no_form_for_is_refused(monkeypatch):
     monkeypatch.setattr("sb3_progpolicy.zoo.load_entries", lambda _: {"default": entry})
     with pytest.raises(ValueError, match=r"default: learning_rate='lin_0.5_0.1' has no form in the zoo"):
         zoo_hyperparams("reptile_ppo")
+
+
+def test_model_with_a_schedule_of_the_zoos_own_kind_is_saved_and_loaded(tmp_path):
+    register()
+    rate = zoo_utils.SimpleLinearSchedule(0.5)
+    model = ALGOS["reptile_ppo"]("ProgPolicy", "Hanoi-v0", n_envs=2, n_steps=8, learning_rate=rate, seed=0)
+    model.learn(16)
+    model.save(tmp_path / "model")
+    loaded = ReptilePPO.load(tmp_path / "model")
+    assert [loaded.lr_schedule(left) for left in (1.0, 0.5, 0.0)] == [0.5, 0.25, 0.0]
 
 
 def test_algorithms_of_others_and_other_commands_are_refused():
