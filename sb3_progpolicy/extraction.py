@@ -38,7 +38,7 @@ def extract_program(model: BaseAlgorithm, **metadata: Any) -> Program:
     It reads what the environment gives. What ``VecNormalize`` does to observations is folded into it, which is exact as
     long as ``clip_obs`` is not reached. Other wrappers are named in ``metadata["wrappers"]``, and
     the symmetry that ties the weights in ``metadata["symmetry"]``, and the conditions that were tried in
-    ``metadata["growth"]`` (``search_method="growth"`` of ReptilePPO).
+    ``metadata["growth"]``, where the search was by growth.
 
     :param model: of any algorithm, with the policy ``ProgPolicy`` or ``PRLPolicy``
     :param metadata: JSON values to keep with it; environment id, seed, number of steps and way of
