@@ -5,13 +5,10 @@ import sys
 
 import pytest
 import yaml
-from rl_zoo3 import ALGOS
-from rl_zoo3 import utils as zoo_utils
 
-from sb3_progpolicy import ReptilePPO
 from sb3_progpolicy.experiment.methods import METHODS
 from sb3_progpolicy.hyperparams import load_entries
-from sb3_progpolicy.zoo import main, register, zoo_hyperparams
+from sb3_progpolicy.zoo import main, zoo_hyperparams
 
 OURS = [name for name, method in METHODS.items() if method.has_reptile]
 
@@ -54,14 +51,26 @@ def test_schedule_that_the_zoo_has_no_form_for_is_refused(monkeypatch):
         zoo_hyperparams("reptile_ppo")
 
 
+# In a process of its own: importing the zoo changes Gymnasium's TimeLimit.
+SCHEDULE = """
+import sys
+from rl_zoo3 import ALGOS
+from rl_zoo3.utils import SimpleLinearSchedule
+from sb3_progpolicy import ReptilePPO
+from sb3_progpolicy.zoo import register
+
+register()
+rate = SimpleLinearSchedule(0.5)
+model = ALGOS["reptile_ppo"]("ProgPolicy", "Hanoi-v0", n_envs=2, n_steps=8, learning_rate=rate, seed=0)
+model.learn(16).save(sys.argv[1])
+print([ReptilePPO.load(sys.argv[1]).lr_schedule(left) for left in (1.0, 0.5, 0.0)])
+"""
+
+
 def test_model_with_a_schedule_of_the_zoos_own_kind_is_saved_and_loaded(tmp_path):
-    register()
-    rate = zoo_utils.SimpleLinearSchedule(0.5)
-    model = ALGOS["reptile_ppo"]("ProgPolicy", "Hanoi-v0", n_envs=2, n_steps=8, learning_rate=rate, seed=0)
-    model.learn(16)
-    model.save(tmp_path / "model")
-    loaded = ReptilePPO.load(tmp_path / "model")
-    assert [loaded.lr_schedule(left) for left in (1.0, 0.5, 0.0)] == [0.5, 0.25, 0.0]
+    command = [sys.executable, "-W", "ignore", "-c", SCHEDULE, str(tmp_path / "model")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.stdout.splitlines()[-1:] == ["[0.5, 0.25, 0.0]"], done.stderr
 
 
 def test_algorithms_of_others_and_other_commands_are_refused():
