@@ -19,19 +19,19 @@ import argparse
 import io
 import multiprocessing
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.progress import track
-from study import RESULTS, commit, train, write_results
+from study import RESULTS, commit, overrides_from, train, write_results
 
 import sb3_progpolicy.pretrained
 from progpolicy_envs import find_domain
 from sb3_progpolicy.env_ids import spec_of
 from sb3_progpolicy.evaluation import Evaluation, evaluate_program
-from sb3_progpolicy.imitation.rollouts import Pool, play, program_act
+from sb3_progpolicy.imitation.rollouts import Pool, ProgramAct, play
 from sb3_progpolicy.programs import Program
 from sb3_progpolicy.programs.files import write_atomically
 
@@ -48,8 +48,10 @@ def run_seed(job: tuple[str, int, Path, dict[str, Any], int, bool]) -> list[Row]
     """Train and evaluate one seed."""
     env_id, seed, folder, overrides, episodes, final = job
     program = train(env_id, seed, folder, overrides)
-    rows = returns_of(program, env_id, episodes) if find_domain(env_id) is None else []
-    rows = rows or list(results_of(program, env_id, episodes, final))
+    if find_domain(env_id) is None:
+        rows = returns_of(program, env_id, episodes)
+    else:
+        rows = list(results_of(program, env_id, episodes, final))
     about = {
         "seed": seed,
         "n_conditions": len(program.conditions),
@@ -89,7 +91,7 @@ def returns_of(program: Program, env_id: str, episodes: int) -> list[Row]:
     rows = []
     for semantics in SEMANTICS:
         with Pool(env_id, min(episodes, 25), interaction=program.interaction) as pool:
-            played = play(pool, [{}], episodes, EVALUATION_SEED, program_act(program, len(pool), semantics))
+            played = play(pool, [{}], episodes, EVALUATION_SEED, ProgramAct(program, len(pool), semantics))
         rows.append(
             {
                 "set": "train",
@@ -177,13 +179,6 @@ def ship(env_id: str, folder: Path, seed: int) -> None:
     print(f"seed {seed} is shipped as {name}")
 
 
-def overrides_from(pairs: Iterable[str]) -> Mapping[str, Any]:
-    """Return the hyperparameters that ``key:value`` texts give."""
-    from sb3_progpolicy.hyperparams import parse_value
-
-    return {key: parse_value(value) for key, _, value in (pair.partition(":") for pair in pairs)}
-
-
 def main() -> None:
     """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -200,7 +195,7 @@ def main() -> None:
     options = parser.parse_args()
     spec_of(options.env)
     commit()  # of the code that is loaded now
-    overrides = dict(overrides_from(options.hyperparams))
+    overrides = overrides_from(options.hyperparams)
     name = options.name or f"{options.env.rpartition(':')[2].rpartition('-')[0].lower()}_seeds"
     folder = Path("runs") / name
     jobs = [(options.env, seed, folder, overrides, options.episodes, options.final) for seed in range(options.seeds)]

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.progress import track
-from study import RESULTS, train, write_results
+from study import RESULTS, overrides_from, train, write_results
 
 from sb3_progpolicy.evaluation import Evaluation, evaluate_program
 from sb3_progpolicy.programs import Program
@@ -118,8 +118,6 @@ def summarise(rows: list[dict[str, Any]]) -> None:
 
 def main() -> None:
     """Run the study."""
-    from sb3_progpolicy.hyperparams import parse_value
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=10, help="number of seeds, from 0 on")
     parser.add_argument("--workers", type=int, default=2, help="seeds trained at the same time")
@@ -128,7 +126,7 @@ def main() -> None:
         "--hyperparams", nargs="*", default=[], metavar="KEY:VALUE", help="in place of the shipped ones"
     )
     options = parser.parse_args()
-    overrides = {key: parse_value(value) for key, _, value in (pair.partition(":") for pair in options.hyperparams)}
+    overrides = overrides_from(options.hyperparams)
     jobs = [(seed, Path("runs") / options.name, overrides) for seed in range(options.seeds)]
     with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
         done = track(pool.imap(run_seed, jobs), "Seeds", total=len(jobs))

@@ -32,7 +32,7 @@ from progpolicy_envs import find_domain
 from sb3_progpolicy.cli.parsing import parse_variations
 from sb3_progpolicy.env_ids import spec_of
 from sb3_progpolicy.imitation import Imitation, imitate, make_teacher
-from sb3_progpolicy.imitation.rollouts import Episodes, Pool, play, program_act
+from sb3_progpolicy.imitation.rollouts import Episodes, Pool, ProgramAct, play
 from sb3_progpolicy.programs import Program
 from sb3_progpolicy.programs.files import write_atomically
 
@@ -120,7 +120,7 @@ def rows_of(
     about = {"seed": seed, "commit": commit(), **_about(program)}
     with Pool(env_id, min(episodes, 25), interaction=program is not None and program.interaction) as pool:
         judge = make_teacher(teacher, pool.envs[0])
-        act = None if program is None else program_act(program, len(pool))
+        act = None if program is None else ProgramAct(program, len(pool))
         for kind, variation in wanted:
             played = play(pool, [variation], episodes, EVALUATION_SEED, act, judge)
             rows.append({"set": kind, **_row(variation, played), **about})

@@ -11,7 +11,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -24,12 +24,18 @@ from sb3_progpolicy.experiment.config import make_config
 from sb3_progpolicy.experiment.folder import CONFIG, describe_run
 from sb3_progpolicy.experiment.run import TrainingOptions, build_model, resume
 from sb3_progpolicy.experiment.run import train as train_run
+from sb3_progpolicy.hyperparams import parse_value
 from sb3_progpolicy.programs import Program
 from sb3_progpolicy.programs.files import write_atomically
 
 RESULTS = Path(__file__).parent / "results"
 SAVE_FREQ = 250_000  # environment steps between two checkpoints
 _PACKAGES = ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy", "pybullet")
+
+
+def overrides_from(pairs: Iterable[str]) -> dict[str, Any]:
+    """Return the hyperparameters that texts of the form ``key:value`` give."""
+    return {key: parse_value(value) for key, _, value in (pair.partition(":") for pair in pairs)}
 
 
 def train(env_id: str, seed: int, folder: Path, overrides: dict[str, Any]) -> Program:

@@ -17,7 +17,7 @@ from sb3_progpolicy.imitation.judge import Judge
 from sb3_progpolicy.imitation.learner import Learner, Settings
 from sb3_progpolicy.imitation.memory import SHARES, MemoryRun, imitate_with_memory
 from sb3_progpolicy.imitation.recurrent import RECURRENT_CELLS
-from sb3_progpolicy.imitation.rollouts import Collector, Pool, Variations, program_act
+from sb3_progpolicy.imitation.rollouts import Collector, Pool, ProgramAct, Variations
 from sb3_progpolicy.imitation.saving import Scored, State, load_state, save_state
 from sb3_progpolicy.imitation.tasks import names_of, training_variations
 from sb3_progpolicy.imitation.teachers import Teacher, TeacherLike, make_teacher
@@ -234,7 +234,7 @@ class _Run:
                 callback(Imitation(done, total, n_labelled, self.result, self.judge.teacher_episodes.summary(), best))
 
         def score(program: Program) -> float:
-            reached = self.judge.score(program_act(program, len(self.pool)))
+            reached = self.judge.score(ProgramAct(program, len(self.pool)))
             self.result = self.judge.last_result
             return reached
 
@@ -389,10 +389,10 @@ class _Run:
         for digits in _DIGITS:
             candidate = rounded(raw, digits, self.codec.unit)
             program = self._program(candidate)
-            changed = self.codec.distance(program_act(program, len(states))(states), exact).mean()
+            changed = self.codec.distance(ProgramAct(program, len(states))(states), exact).mean()
             if changed > _CHANGED:
                 continue
-            if self.judge.as_good(self.judge.score(program_act(program, len(self.pool)), score), score, share=0.5):
+            if self.judge.as_good(self.judge.score(ProgramAct(program, len(self.pool)), score), score, share=0.5):
                 return candidate
         return raw
 

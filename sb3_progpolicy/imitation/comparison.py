@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sb3_progpolicy.imitation.actions import ActionCodec
-from sb3_progpolicy.imitation.rollouts import Pool, Variations, play, program_act
+from sb3_progpolicy.imitation.rollouts import Pool, ProgramAct, Variations, play
 from sb3_progpolicy.imitation.tasks import training_variations
 from sb3_progpolicy.imitation.teachers import TeacherLike, make_teacher
 from sb3_progpolicy.programs.program import Program
@@ -59,7 +59,7 @@ def compare_with_teacher(
         codec = ActionCodec(program.action, program.output_names)
         variations, _ = training_variations(env_id, tasks)
         own = play(pool, variations, n_episodes, seed, None, judge)
-        act = program_act(program, len(pool))
+        act = ProgramAct(program, len(pool))
         imitated = play(pool, variations, n_episodes, seed, act, judge, codec.distance)
         return Comparison(own.summary(), imitated.summary(), imitated.distance)
     finally:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sb3_progpolicy.imitation.actions import ActionCodec
 from sb3_progpolicy.imitation.recurrent import Sequences, fit_sequences, map_numbers, rounded_body
-from sb3_progpolicy.imitation.rollouts import Act, Collector, program_act
+from sb3_progpolicy.imitation.rollouts import Act, Collector, ProgramAct
 from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.programs.syntax import Expression
 
@@ -62,7 +62,7 @@ def imitate_with_memory(run: MemoryRun, n_steps: int) -> Program:
     best: tuple[float, Program] | None = None
     for number, share in enumerate(SHARES):
         run.collector.begin()
-        act: Act | None = None if present is None else program_act(present, len(run.collector.pool))
+        act: Act | None = None if present is None else ProgramAct(present, len(run.collector.pool))
         parts.append(_labelled(run, n_steps * (1 if number else 2), act, share))
         data = Sequences.of(parts)
         last = number == len(SHARES) - 1

@@ -215,11 +215,6 @@ class ProgramAct:
         return self._runner.act(observations)
 
 
-def program_act(program: ProgramData, n_envs: int, semantics: Semantics = "crisp") -> ProgramAct:
-    """Return a program as a function from observations to actions."""
-    return ProgramAct(program, n_envs, semantics)
-
-
 @dataclass
 class Visits:
     """States visited, with labels.

@@ -12,7 +12,7 @@ from sb3_progpolicy.imitation import algorithm, memory, recurrent
 from sb3_progpolicy.imitation.learner import Settings
 from sb3_progpolicy.imitation.losses import DiscreteLoss
 from sb3_progpolicy.imitation.recurrent import Sequences, fit_sequences, map_numbers, rounded_body
-from sb3_progpolicy.imitation.rollouts import Pool, play, program_act
+from sb3_progpolicy.imitation.rollouts import Pool, ProgramAct, play
 from sb3_progpolicy.programs import Program, ProgramRunner
 
 FORWARD, LEFT, RIGHT = 0, 1, 2
@@ -93,7 +93,7 @@ def test_same_seed_gives_the_same_fit():
 
 def test_episodes_of_a_validation_begin_without_memory(remembering):
     pool = Pool("TMaze-v0", 4)
-    act = program_act(remembering, 4)
+    act = ProgramAct(remembering, 4)
     first, second = (play(pool, [{}], 4, 9, act) for _ in range(2))
     np.testing.assert_array_equal(first.returns, second.returns)
     act(np.ones((4, 2)))
