@@ -6,8 +6,10 @@
 
 Each seed trains from scratch with ``sb3_progpolicy/hyperparams/reptile_ppo.yml``, the same for all. Its program is
 then run, crisp and soft, on every training and validation variation, on starts that training did not use. With
---final it is run on the unseen variations, too, which nothing is chosen by. A finished seed is kept in ``runs/`` and
-one that is interrupted goes on from its last checkpoint.
+--final it is run on the unseen variations, too, which nothing is chosen by. With --simplify each program is also
+simplified: few terms with the same success and steps on the training variations (``equally_good="outcome"``). Then
+--ship takes the simplified one of the median seed. A finished seed is kept in ``runs/`` and one that is interrupted
+goes on from its last checkpoint.
 
 Writes ``benchmarks/results/<name>.csv``, a picture of the crisp programs, and a ``.json`` with command, commit and
 versions. Says which seed is the median by what was reached in training; --ship puts it into the package.
@@ -29,45 +31,70 @@ from study import RESULTS, commit, overrides_from, train, write_results
 
 import sb3_progpolicy.pretrained
 from progpolicy_envs import find_domain
+from sb3_progpolicy.analysis.rules import count_numbers
+from sb3_progpolicy.analysis.simplify import simplify
 from sb3_progpolicy.env_ids import spec_of
 from sb3_progpolicy.evaluation import Evaluation, evaluate_program
 from sb3_progpolicy.imitation.rollouts import Pool, ProgramAct, play
 from sb3_progpolicy.programs import Program
 from sb3_progpolicy.programs.files import write_atomically
+from sb3_progpolicy.programs.io import program_digest
 
 COLUMNS = (
     *("seed", "set", "variation", "semantics", "episodes", "success_rate", "steps_mean", "ratio", "return_mean"),
-    *("n_conditions", "timesteps", "train_seconds"),
+    *("n_conditions", "n_numbers", "timesteps", "train_seconds"),
 )
 SEMANTICS = ("crisp", "soft")
+SMALL = "_small"  # at the end of the names of simplified programs
 EVALUATION_SEED = 10_000
 Row = dict[str, Any]
 
 
-def run_seed(job: tuple[str, int, Path, dict[str, Any], int, bool]) -> list[Row]:
+def run_seed(job: tuple[str, int, Path, dict[str, Any], int, bool, bool]) -> list[Row]:
     """Train and evaluate one seed."""
-    env_id, seed, folder, overrides, episodes, final = job
+    env_id, seed, folder, overrides, episodes, final, simplified = job
     program = train(env_id, seed, folder, overrides)
     if find_domain(env_id) is None:
-        rows = returns_of(program, env_id, episodes)
-    else:
-        rows = list(results_of(program, env_id, episodes, final))
+        return _about(seed, program, returns_of(program, env_id, episodes))
+    rows = _about(seed, program, results_of(program, env_id, episodes, final, SEMANTICS))
+    if simplified:
+        small = simplified_of(program, env_id, folder / f"seed_{seed}{SMALL}.json")
+        found = results_of(small, env_id, episodes, final, ("crisp",))
+        rows += _about(seed, small, ({**row, "semantics": "simplified"} for row in found))
+    return rows
+
+
+def simplified_of(program: Program, env_id: str, path: Path) -> Program:
+    """Return a program's simplified form, found now or read from a file."""
+    if path.exists():
+        known = Program.load(path)
+        if known.metadata.get("simplified", {}).get("from") == program_digest(program):
+            return known
+    small = simplify(program, env_id, equally_good="outcome").program
+    small.save(path)
+    return small
+
+
+def _about(seed: int, program: Program, rows: Iterable[Row]) -> list[Row]:
     about = {
         "seed": seed,
         "n_conditions": len(program.conditions),
+        "n_numbers": count_numbers(program),
         "timesteps": program.metadata["timesteps"],
         "train_seconds": program.metadata["train_seconds"],
     }
     return [{**about, **row} for row in rows]
 
 
-def results_of(program: Program, env_id: str, episodes: int, final: bool) -> Iterable[Row]:
+def results_of(
+    program: Program, env_id: str, episodes: int, final: bool, all_semantics: Sequence[str]
+) -> Iterable[Row]:
     """Run a program on the variations of its domain."""
     domain = find_domain(env_id)
     assert domain is not None
     sets = {"train": domain.trained, "validation": domain.validation, **({"unseen": domain.unseen} if final else {})}
     for kind, variations in sets.items():
-        for semantics in SEMANTICS:
+        for semantics in all_semantics:
             for row in evaluate_program(
                 program, env_id, variations, episodes, semantics=semantics, seed=EVALUATION_SEED
             ):
@@ -107,11 +134,18 @@ def returns_of(program: Program, env_id: str, episodes: int) -> list[Row]:
     return rows
 
 
+def run_at_last(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows of the programs that are to be run: the simplified ones, else the crisp ones."""
+    return [row for row in rows if row["semantics"] == "simplified"] or [
+        row for row in rows if row["semantics"] == "crisp"
+    ]
+
+
 def median_seed(rows: Sequence[Row]) -> int:
-    """Return the seed whose crisp program is the median by what it reached on the training variations."""
+    """Return the seed whose program is the median by what it reached on the training variations."""
     merits: dict[int, list[tuple[float, float]]] = {}
-    for row in rows:
-        if row["set"] == "train" and row["semantics"] == "crisp":
+    for row in run_at_last(rows):
+        if row["set"] == "train":
             first = row["return_mean"] if row["success_rate"] == "" else row["success_rate"]
             merits.setdefault(row["seed"], []).append((float(first), -float(row["steps_mean"])))
     ranked = sorted(merits, key=lambda seed: tuple(np.mean(merits[seed], axis=0)))
@@ -119,7 +153,7 @@ def median_seed(rows: Sequence[Row]) -> int:
 
 
 def plot(name: str, rows: Sequence[Row], title: str) -> None:
-    """Draw what each seed's crisp program reaches on each variation: success, and steps as a multiple of the planner's.
+    """Draw what each seed's program reaches on each variation: success, and steps as a multiple of the planner's.
 
     Where there is no success, the return.
     """
@@ -128,7 +162,7 @@ def plot(name: str, rows: Sequence[Row], title: str) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    crisp = [row for row in rows if row["semantics"] == "crisp"]
+    crisp = run_at_last(rows)
     labels = list(dict.fromkeys((row["set"], row["variation"]) for row in crisp))
     columns = {"success_rate": "success", "ratio": "steps / planner's", "return_mean": "return"}
     shown = [name for name in columns if any(row[name] != "" for row in crisp)]
@@ -158,8 +192,8 @@ def plot(name: str, rows: Sequence[Row], title: str) -> None:
 
 
 def summarise(rows: Sequence[Row]) -> None:
-    """Print for each variation what the crisp programs reach."""
-    crisp = [row for row in rows if row["semantics"] == "crisp"]
+    """Print for each variation what the programs reach."""
+    crisp = run_at_last(rows)
     for kind, variation in dict.fromkeys((row["set"], row["variation"]) for row in crisp):
         here = [row for row in crisp if (row["set"], row["variation"]) == (kind, variation)]
         parts = []
@@ -171,11 +205,11 @@ def summarise(rows: Sequence[Row]) -> None:
         print(f"{variation or 'as trained'} ({kind}): {'; '.join(parts)} (least, median, most)")
 
 
-def ship(env_id: str, folder: Path, seed: int) -> None:
+def ship(env_id: str, folder: Path, seed: int, simplified: bool) -> None:
     """Put the program of a seed into the package."""
     name = f"{env_id.rpartition(':')[2]}.json"
     target = Path(sb3_progpolicy.pretrained.__file__).with_name(name)
-    shutil.copy(folder / f"seed_{seed}.json", target)
+    shutil.copy(folder / f"seed_{seed}{SMALL if simplified else ''}.json", target)
     print(f"seed {seed} is shipped as {name}")
 
 
@@ -188,26 +222,31 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1, help="seeds trained at the same time")
     parser.add_argument("--final", action="store_true", help="look at the unseen variations, too")
     parser.add_argument("--ship", action="store_true", help="put the median seed's program into the package")
+    parser.add_argument("--simplify", action="store_true", help="simplify each program, and run that, too")
     parser.add_argument("--name", help="name of the result files; that of the domain by default")
     parser.add_argument(
         "--hyperparams", nargs="*", default=[], metavar="KEY:VALUE", help="in place of the shipped ones"
     )
     options = parser.parse_args()
     spec_of(options.env)
+    if options.simplify and find_domain(options.env) is None:
+        parser.error(f"--simplify is for domains, whose variations it looks at; {options.env} is of none")
     commit()  # of the code that is loaded now
     overrides = overrides_from(options.hyperparams)
     name = options.name or f"{options.env.rpartition(':')[2].rpartition('-')[0].lower()}_seeds"
     folder = Path("runs") / name
-    jobs = [(options.env, seed, folder, overrides, options.episodes, options.final) for seed in range(options.seeds)]
+    common = (folder, overrides, options.episodes, options.final, options.simplify)
+    jobs = [(options.env, seed, *common) for seed in range(options.seeds)]
     with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
         done = track(pool.imap(run_seed, jobs), "Seeds", total=len(jobs))
         rows = [row for seed_rows in done for row in seed_rows]
     write_results(name, COLUMNS, rows, overrides)
-    plot(name, rows, f"{options.env}: {options.seeds} seeds, crisp programs, {options.episodes} episodes each")
+    kind = run_at_last(rows)[0]["semantics"]
+    plot(name, rows, f"{options.env}: {options.seeds} seeds, {kind} programs, {options.episodes} episodes each")
     summarise(rows)
     print(f"the median seed by what was reached in training: {median_seed(rows)}")
     if options.ship:
-        ship(options.env, folder, median_seed(rows))
+        ship(options.env, folder, median_seed(rows), options.simplify)
 
 
 if __name__ == "__main__":

@@ -147,10 +147,21 @@ def with_controllers(program: ProgramData, matrices: Sequence[Floats]) -> Progra
     :param program: whose conditions stay
     :param matrices: weights and constant of each controller, ``(n_outputs, n_inputs + 1)``
     """
-    controllers = [
-        Controller(tuple(map(tuple, matrix[:, :-1].tolist())), tuple(matrix[:, -1].tolist())) for matrix in matrices
-    ]
-    body: Expression = controllers[-1]
-    for condition, controller in reversed(list(zip(program.conditions, controllers[:-1], strict=True))):
-        body = IfThenElse(condition, controller, body)
+    return with_branches(program, dict(enumerate(matrices)))
+
+
+def with_branches(program: ProgramData, matrices: Mapping[int, Floats]) -> ProgramData:
+    """Return a program of some of a program's branches, with other controllers.
+
+    :param program: whose conditions stay
+    :param matrices: weights and constant of controllers, ``(n_outputs, n_inputs + 1)``, by the index of the branch
+    """
+    *others, last = sorted(matrices)
+    body: Expression = _controller(matrices[last])
+    for index in reversed(others):
+        body = IfThenElse(program.conditions[index], _controller(matrices[index]), body)
     return dataclasses.replace(program, body=body)
+
+
+def _controller(matrix: Floats) -> Controller:
+    return Controller(tuple(map(tuple, matrix[:, :-1].tolist())), tuple(matrix[:, -1].tolist()))

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progpolicy_envs import Domain, get_domain
-from sb3_progpolicy.analysis.box import Point, Pruned, prune
 from sb3_progpolicy.analysis.integer import MAX_WEIGHT
+from sb3_progpolicy.analysis.prune import Point, Pruned, prune
 from sb3_progpolicy.analysis.rules import Rules, count_numbers
 from sb3_progpolicy.analysis.situations import Situations, meet, meet_in
 from sb3_progpolicy.analysis.switches import disagreements, replace_switches
@@ -24,7 +24,8 @@ from sb3_progpolicy.programs.io import program_digest
 from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.programs.syntax import ProgramData
 
-EquallyGood = Literal["program", "planner"]
+EquallyGood = Literal["program", "planner", "outcome"]
+_CHOICES = ("program", "planner", "outcome")
 #: What is said of a point of a curve.
 CURVE = ("terms", "success_rate", "steps_mean")
 #: How often situations that only the simplified program meets are added.
@@ -43,13 +44,14 @@ class Simplification:
     :param terms_lower_bound: no program of this form has fewer terms
     :param tied: whether one rule stands for all directions
     :param symmetry: name of the symmetry that ties it; ``None`` if it is not tied
-    :param equally_good: whose actions were kept to: the original's, or all that the planner calls as good
+    :param equally_good: what was kept to: the original's actions, any that the planner calls as good, or success and
+        steps within a tolerance
     :param situations: distinct inputs that were looked at
     :param starts: from how many starts they come
     :param exhaustive: whether these are all starts of the training variations
     :param seconds: that it took
     :param notes: what was tried and did not succeed, in sentences
-    :param curve: for Box actions what programs of other numbers of terms reach on the training variations
+    :param curve: where success and steps were kept, what programs of other numbers of terms reach
     """
 
     program: Program
@@ -98,25 +100,28 @@ def simplify(
     row and column on grids. A recurrent condition of one unit becomes a switch, "on when ..., off when ...", if
     one has the same decisions at every step of whole episodes; others stay as they are.
 
-    With Box actions no numbers do exactly the same. There terms are added one by one, those first that bring the
-    actions nearest to the original's, fitted by least squares on the states that the original meets and rounded, until
-    success and steps on the training variations are within a tolerance; then those are left out again without which
-    they still are. Branches that never act are dropped. If asked, PPO then trains the numbers of the controllers that
+    With Box actions no numbers do exactly the same: success and steps are kept instead. With Discrete ones, too, if it
+    is asked for (``equally_good="outcome"``), since not all that a program does is of use. Terms are added one by one,
+    those first that bring the actions nearest to the original's, fitted on the states that the original meets (least
+    squares; for Discrete actions the likelihood of its choices) and rounded, until success and steps on the training
+    variations are within a tolerance; then those are left out again without which they still are. Branches that never
+    act are dropped, conditions stay as they are. If asked, PPO then trains the numbers of continuous controllers that
     are left; what comes of it is taken if success and steps on the training variations are better.
 
     :param program: acts in a Discrete space or a Box
     :param env_id: id of a planning domain; by default the one in the program's metadata
     :param variations: to look at; by default those that the domain is trained on
     :param equally_good: ``"program"`` keeps to the program's own actions, ``"planner"`` to those that begin a shortest
-        solution, each of which is made to beat all others
+        solution, each of which is made to beat all others, ``"outcome"`` to success and steps; with Box actions the
+        first and the last are the same
     :param tie: whether to tie weights over the domain's symmetries
     :param n_starts: starts of each variation that are looked at; drawn where there are more
     :param time_limit: seconds for each rule
     :param max_weight: largest size of a weight
-    :param episodes: with Box actions, of each evaluation, on each variation
-    :param success_tolerance: with Box actions, by how much the share of successes may fall
-    :param steps_tolerance: with Box actions, by what share the steps may rise
-    :param n_terms: with Box actions, take the program of so many terms, good enough or not
+    :param episodes: where success and steps are kept, of each evaluation, on each variation
+    :param success_tolerance: where these are kept, by how much the share of successes may fall
+    :param steps_tolerance: where these are kept, by what share the steps may rise
+    :param n_terms: where these are kept, take the program of so many terms, good enough or not
     :param finetune: with Box actions, environment steps of that training; ``None`` for none
     :param seed: of the drawn starts
     :raises ValueError: if an argument is not accepted
@@ -125,12 +130,13 @@ def simplify(
     env_id = env_id or str(program.metadata.get("env") or "")
     if not env_id:
         raise ValueError("the program does not say which environment it is for; give env_id")
-    if equally_good not in ("program", "planner"):
-        raise unknown("equally_good", equally_good, ("program", "planner"))
+    if equally_good not in _CHOICES:
+        raise unknown("equally_good", equally_good, _CHOICES)
     if finetune is not None and finetune < 1:
         raise ValueError(f"finetune={finetune} is not accepted; it is at least 1")
     if program.action.kind not in ("discrete", "box"):
         raise ValueError(f"{program.action.kind} actions are not accepted here; Discrete and Box ones are")
+    box = program.action.kind == "box"
     refuse_wrappers("the program", program.metadata.get("wrappers", ()))
     domain = get_domain(env_id)
     variations = domain.trained if variations is None else variations
@@ -147,9 +153,11 @@ def simplify(
         seed=seed,
     )
     original, program = program, switched.program
-    if program.action.kind == "box":
-        if equally_good != "program":
-            raise ValueError(f"equally_good={equally_good!r} is not accepted for Box actions; it is for Discrete ones")
+    if box and equally_good == "planner":
+        raise ValueError("equally_good='planner' is not accepted for Box actions; it is for Discrete ones")
+    if not box and finetune is not None:
+        raise ValueError(f"finetune={finetune} is not accepted for Discrete actions; it is for Box ones")
+    if box or equally_good == "outcome":
         pruned = prune(
             program,
             env_id,
@@ -164,9 +172,10 @@ def simplify(
         )
         return _of_pruned(original, pruned, domain, began)
     if n_terms is not None:
-        raise ValueError(f"n_terms={n_terms} is not accepted for Discrete actions; the fewest are found")
-    if finetune is not None:
-        raise ValueError(f"finetune={finetune} is not accepted for Discrete actions; their decisions stay the same")
+        raise ValueError(
+            f"n_terms={n_terms} is not accepted for Discrete actions with equally_good={equally_good!r}, of which the "
+            "fewest are found; it is with equally_good='outcome'"
+        )
     planner = equally_good == "planner"
     situations = meet(program, env_id, variations, n_starts, planner, seed)
     if not len(situations.inputs):
@@ -225,7 +234,12 @@ def _of_pruned(program: ProgramData, pruned: Pruned, domain: Domain, began: floa
     terms = pruned.point.terms or count_numbers(program)
     metadata = dict(program.metadata)
     if small.body != program.body:
-        metadata["simplified"] = {"from": program_digest(program), "terms": terms, "symmetry": symmetry}
+        metadata["simplified"] = {
+            "from": program_digest(program),
+            "terms": terms,
+            "symmetry": symmetry,
+            "equally_good": "outcome",
+        }
     if pruned.finetuned:
         metadata["simplified"]["finetuned"] = pruned.finetuned
         metadata["learned_by"] = pruned.learned_by
@@ -236,7 +250,7 @@ def _of_pruned(program: ProgramData, pruned: Pruned, domain: Domain, began: floa
         terms_lower_bound=0,
         tied=pruned.tied,
         symmetry=symmetry,
-        equally_good="tolerance",
+        equally_good="outcome",
         situations=pruned.states,
         starts=pruned.episodes,
         exhaustive=False,

@@ -25,7 +25,11 @@ def simplify(
         list[str] | None, typer.Option("--set", help="variations to look at; by default the training ones")
     ] = None,
     equally_good: Annotated[
-        str, typer.Option("--equally-good", help="program: keep to its actions; planner: to any of a shortest solution")
+        str,
+        typer.Option(
+            "--equally-good",
+            help="program: keep to its actions; planner: to any of a shortest solution; outcome: to success and steps",
+        ),
     ] = "program",
     tie: Annotated[bool, typer.Option("--tie/--no-tie", help="one rule for all directions, if there is one")] = True,
     starts: Annotated[int, typer.Option("--starts", min=1, help="of each variation, drawn if it has more")] = 300,
@@ -34,13 +38,14 @@ def simplify(
     seed: Annotated[int, typer.Option("--seed", min=0, help="of the drawn starts")] = 0,
     episodes: Annotated[int, typer.Option("--episodes", min=1, help="of the comparison, on each variation")] = 20,
     terms: Annotated[
-        int | None, typer.Option("--terms", min=1, help="continuous actions: take the program of so many terms")
+        int | None,
+        typer.Option("--terms", min=1, help="continuous actions or outcome: take the program of so many terms"),
     ] = None,
     finetune: Annotated[
         int | None, typer.Option("--finetune", min=1, help="continuous actions: then train it on for so many steps")
     ] = None,
     curve: Annotated[
-        Path | None, typer.Option("--curve", help="continuous actions: .csv or .png of terms against success and steps")
+        Path | None, typer.Option("--curve", help="the same: .csv or .png of terms against success and steps")
     ] = None,
     env: Annotated[str | None, typer.Option("--env", help="another environment than it was trained in")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="a JSON object on stdout, nothing else")] = False,
@@ -77,7 +82,7 @@ def simplify(
         )
         if curve is not None:
             if not found.curve:
-                raise ValueError("--curve is for continuous actions; of discrete ones the fewest terms are found")
+                raise ValueError("--curve is for continuous actions, or with --equally-good outcome")
             _write_curve(found, curve)
         if output is not None:
             found.program.save(output)

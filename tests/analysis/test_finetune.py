@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sb3_progpolicy import evaluate_program, load_pretrained, simplify
-from sb3_progpolicy.analysis import box
+from sb3_progpolicy.analysis import prune
 from sb3_progpolicy.analysis.finetune import finetune
 from sb3_progpolicy.cli import run
 from sb3_progpolicy.programs import Condition, Controller, IfThenElse
@@ -63,10 +63,10 @@ def test_simplified_program_is_trained_on_and_says_so():
 
 def outcome(before, after, good):
     """What is made of a pruned program when training changes its success and steps."""
-    worse = box.Point(2, point.slow(), *before)
-    pruned = box.Pruned(worse, (worse,), 10, 10, False, ())
+    worse = prune.Point(2, point.slow(), *before)
+    pruned = prune.Pruned(worse, (worse,), 10, 10, False, ())
     learned = (point.slow(-2.345678), "imitation+reinforcement")
-    return box._finetuned(pruned, lambda program: learned, 100, lambda program: after, lambda *one: good(*one))
+    return prune._finetuned(pruned, lambda program: learned, 100, lambda program: after, lambda *one: good(*one))
 
 
 @pytest.mark.parametrize(

@@ -199,6 +199,50 @@ def test_fewest_terms_are_found_with_their_bound():
     assert fewest_terms(np.array([[1.0, 0.0], [-1.0, 0.0]]), 5) is None
 
 
+def right_hand(noise, seed=0):
+    """The right-hand rule of HikingEgo, tied over the compass, with some noise in every weight."""
+    program, rng = load_pretrained("HikingEgo-v0"), np.random.default_rng(seed)
+    terms = terms_of(program, 4, DOMAINS["HikingEgo-v0"].symmetries)
+    matrix = noise * np.einsum("k,koi->oi", rng.normal(size=len(terms)), np.stack([term.weights for term in terms]))
+    names = program.input_names
+    ahead = [names.index(f"window[{cell}]") for cell in ("-1,+0", "+0,+1", "+1,+0", "+0,-1")]
+    previous = [names.index(f"previous {name}") for name in ("north", "east", "south", "west")]
+    for direction in range(4):
+        matrix[direction, ahead[direction]] += 8
+        for turn, weight in ((-1, 4), (0, 2), (1, 1), (2, -2)):  # right turn, straight on, left turn, back
+            matrix[direction, previous[(direction + turn) % 4]] += weight
+    controller = Controller(tuple(map(tuple, matrix[:, :-1].tolist())), tuple(matrix[:, -1].tolist()))
+    return dataclasses.replace(program, body=controller)
+
+
+def test_outcome_finds_the_rule_in_what_was_learnt_with_noise():
+    variations = [{"n_stars": n_stars, "layout": "practice"} for n_stars in (1, 2)]
+    noisy = right_hand(0.2)
+    found = simplify(noisy, "HikingEgo-v0", variations, equally_good="outcome", episodes=8)
+    assert found.symmetry == "compass"
+    assert found.equally_good == "outcome"
+    assert 3 <= found.terms_after <= 8 < count_numbers(noisy) / 20
+    assert found.program.metadata["simplified"]["equally_good"] == "outcome"
+    others = [{"n_stars": 3, "layout": layout} for layout in ("valley", "comb", "fork")]
+    before, after = (
+        np.mean(
+            [row.success_rate for row in evaluate_program(program, "HikingEgo-v0", [*others, *others], n_episodes=4)]
+        )
+        for program in (noisy, found.program)
+    )
+    assert after == 1 >= before
+
+
+def test_number_of_terms_can_be_asked_for_where_success_and_steps_are_kept():
+    found = simplify(load_pretrained("Hanoi-v0"), equally_good="outcome", episodes=5)
+    assert found.terms_after == 4
+    assert found.symmetry == "pegs"
+    assert [point.terms for point in found.curve] == sorted(point.terms for point in found.curve)
+    three = simplify(load_pretrained("Hanoi-v0"), equally_good="outcome", episodes=5, n_terms=3)
+    assert three.terms_after == 3
+    assert min(point.success_rate for point in three.curve if point.terms == 3) < 1
+
+
 def test_continuous_actions_have_no_equally_good_ones():
     with pytest.raises(ValueError, match="equally_good='planner' is not accepted for Box actions"):
         simplify(load_pretrained("PandaReach-v0"), equally_good="planner")
@@ -213,7 +257,9 @@ def test_program_of_a_wrapped_environment_is_refused(analyse):
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    ({"equally_good": "teacher"}, "equally_good.*'teacher'.*program, planner"),
+    ({"equally_good": "teacher"}, "equally_good.*'teacher'.*program, planner, outcome"),
+    ({"equally_good": "outcome", "finetune": 100}, "finetune=100 is not accepted for Discrete actions"),
+    ({"equally_good": "outcome", "n_terms": 39, "episodes": 2}, "n_terms=39 is not accepted; there are programs of"),
     ({"n_terms": 3}, "n_terms=3 is not accepted for Discrete"),
     ({"env_id": "Hanoi-v9"}, "Hanoi-v9"),
     ({"env_id": "Stacking-v0"}, "reads 9 numbers.*has 35"),
@@ -238,7 +284,7 @@ def test_command_writes_the_program_and_says_what_it_costs(tmp_path, capsys):
 
 def test_curve_is_drawn_and_another_point_of_it_can_be_taken(tmp_path, monkeypatch, capsys):
     import sb3_progpolicy.analysis.simplify as module
-    from sb3_progpolicy.analysis.box import Point, Pruned
+    from sb3_progpolicy.analysis.prune import Point, Pruned
 
     program = load_pretrained("PandaReach-v0")
     curve = tuple(Point(terms, program, terms / 3, 30.0 - terms) for terms in (1, 2, 3))
@@ -260,5 +306,5 @@ def test_curve_is_drawn_and_another_point_of_it_can_be_taken(tmp_path, monkeypat
     assert lines[3] == "3,1.0,27.0"
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
     assert run(["simplify", "Hanoi-v0", "--curve", str(tmp_path / "x.csv")]) == 2
-    assert "for continuous actions" in capsys.readouterr().err
+    assert "is for continuous actions" in capsys.readouterr().err
     assert run(["simplify", "Hanoi-v0", "--curve", str(tmp_path / "x.pdf")]) == 2

@@ -1,4 +1,4 @@
-"""Programs with Box actions: fewer and rounder weights, as long as success and steps on training variations hold."""
+"""Fewer and rounder weights, as long as success and steps on the training variations hold."""
 
 from __future__ import annotations
 
@@ -12,17 +12,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from progpolicy_envs import get_domain
 from sb3_progpolicy.analysis.finetune import finetune, matrix_of, why_not, with_controllers
-from sb3_progpolicy.analysis.terms import Floats, Term, terms_of
+from sb3_progpolicy.analysis.paths import MAX_TERMS, BoxPruner, DiscretePruner, Pruner, States
+from sb3_progpolicy.analysis.terms import Floats
 from sb3_progpolicy.evaluation import Evaluation, evaluate_program, success_and_steps
-from sb3_progpolicy.programs.syntax import Controller, Expression, IfThenElse, ProgramData
+from sb3_progpolicy.programs.syntax import ProgramData
 
-MAX_TERMS = 40
 #: States on which weights are fitted, at most.
 MAX_STATES = 20_000
 #: How many times the original's steps a smaller program is given.
 PATIENCE = 4
-_REFITS = 8
+#: How many times a variation is played at the same time.
+_TIMES = 10
 #: Significant digits that are tried, the fewest first.
 _DIGITS = (1, 2, 3)
 
@@ -41,18 +43,6 @@ class Point:
     program: ProgramData
     success_rate: float
     steps_mean: float
-
-
-@dataclass(frozen=True)
-class States:
-    """What a program did on its own way.
-
-    :param inputs: X and the constant, ``(n, n_inputs + 1)``
-    :param branches: index of the controller that acted, ``(n,)``
-    """
-
-    inputs: Floats
-    branches: NDArray[np.int64]
 
 
 def visited(
@@ -81,105 +71,20 @@ def visited(
     return States(np.column_stack([joined, np.ones(len(joined))]), branch), rows
 
 
-class Pruner:
-    """Programs of few terms that do nearly what the original does, one for each number of terms.
+def spread(
+    env_id: str, variations: Sequence[Mapping[str, Any]], episodes: int
+) -> tuple[Sequence[Mapping[str, Any]], int]:
+    """Return the same episodes as more variations of fewer episodes each, where a batch of steps costs little more.
 
-    Terms are added one by one, the one first that brings the actions nearest to the original's; all weights are fitted
-    anew each time, by least squares where neither action is at its bounds on the same side.
-
-    :param program: the original
-    :param states: on which actions are compared
-    :param symmetries: that tie the weights; none for free ones
+    :param env_id: environment id
+    :param variations: of it
+    :param episodes: on each
+    :return: the variations, each several times, and how many episodes on each at least
     """
-
-    def __init__(self, program: ProgramData, states: States, symmetries: Sequence[Any]) -> None:
-        self.program, self.states = program, states
-        self.low, self.high = np.array(program.action.low), np.array(program.action.high)
-        #: The branches that act at all; the others are dropped.
-        self.reached = sorted(set(states.branches.tolist()))
-        self.terms: list[tuple[int, Term]] = [
-            (branch, term)
-            for branch in self.reached
-            for term in terms_of(program, program.action.n_outputs, symmetries)
-        ]
-        self.target = np.zeros((len(states.inputs), program.action.n_outputs))
-        for branch in self.reached:
-            here = states.branches == branch
-            controller = program.controllers[branch]
-            self.target[here] = states.inputs[here] @ matrix_of(controller).T
-        self._features = [self._feature(branch, term) for branch, term in self.terms]
-
-    def _feature(self, branch: int, term: Term) -> Floats:
-        values = self.states.inputs @ term.weights.T
-        values[self.states.branches != branch] = 0
-        return np.asarray(values)
-
-    def path(self, max_terms: int = MAX_TERMS) -> list[tuple[list[int], Floats]]:
-        """Return for each number of terms, from 1, which they are and their weights."""
-        chosen: list[int] = []
-        path = []
-        weights = np.zeros(0)
-        for _ in range(min(max_terms, len(self.terms))):
-            residual = self._residual(chosen, weights)
-            gains = [self._gain(feature, residual) for feature in self._features]
-            gains = [-1.0 if index in chosen else gain for index, gain in enumerate(gains)]
-            best = int(np.argmax(gains))
-            if gains[best] <= 1e-12:
-                break
-            chosen = [*chosen, best]
-            weights = self.fit(chosen)
-            path.append((chosen, weights))
-        return path
-
-    def fit(self, chosen: Sequence[int]) -> Floats:
-        """Return the weights of some terms that bring the actions nearest to the original's.
-
-        :param chosen: indices of terms
-        """
-        matrix = np.stack([self._features[index].ravel() for index in chosen], axis=1)
-        target = self.target.ravel()
-        weights = np.zeros(len(chosen))
-        low, high = (np.broadcast_to(bound, self.target.shape).ravel() for bound in (self.low, self.high))
-        for attempt in range(_REFITS):
-            outputs = matrix @ weights
-            same_bound = ((outputs >= high) & (target >= high)) | ((outputs <= low) & (target <= low))
-            counted = ~same_bound if attempt else np.ones(len(target), dtype=bool)
-            if not counted.any():
-                break
-            # Beyond a bound any number does: the bound itself is asked for.
-            weights = np.linalg.lstsq(matrix[counted], np.clip(target, low, high)[counted], rcond=None)[0]
-        return np.asarray(weights)
-
-    def _residual(self, chosen: Sequence[int], weights: Floats) -> Floats:
-        outputs = np.zeros_like(self.target)
-        for index, weight in zip(chosen, weights, strict=True):
-            outputs += weight * self._features[index]
-        return np.asarray(np.clip(self.target, self.low, self.high) - np.clip(outputs, self.low, self.high))
-
-    @staticmethod
-    def _gain(feature: Floats, residual: Floats) -> float:
-        size = float((feature**2).sum())
-        return 0.0 if size == 0 else float((feature * residual).sum()) ** 2 / size
-
-    def make(self, chosen: Sequence[int], weights: Floats) -> ProgramData:
-        """Return the program of some terms.
-
-        :param chosen: indices of terms
-        :param weights: of these
-        """
-        shape = (self.program.action.n_outputs, self.program.n_inputs + 1)
-        matrices = {branch: np.zeros(shape) for branch in self.reached}
-        for index, weight in zip(chosen, weights.tolist(), strict=True):
-            branch, term = self.terms[index]
-            matrices[branch] += weight * term.weights
-        controllers = {
-            branch: Controller(tuple(map(tuple, matrix[:, :-1].tolist())), tuple(matrix[:, -1].tolist()))
-            for branch, matrix in matrices.items()
-        }
-        body: Expression = controllers[self.reached[-1]]
-        for branch in reversed(self.reached[:-1]):
-            body = IfThenElse(self.program.conditions[branch], controllers[branch], body)
-        return dataclasses.replace(self.program, body=body)
+    if get_domain(env_id).simulation:
+        return variations, episodes
+    times = min(_TIMES, episodes)
+    return [variation for variation in variations for _ in range(times)], math.ceil(episodes / times)
 
 
 def rounded(weights: Floats, digits: int) -> Floats:
@@ -289,7 +194,7 @@ def prune(
 ) -> Pruned:
     """Return a program of few, round weights that is as good on the training variations.
 
-    :param program: acts in a Box
+    :param program: acts in a Discrete space or a Box
     :param env_id: environment id
     :param variations: of it
     :param symmetries: that are to tie the weights
@@ -301,6 +206,7 @@ def prune(
     :param seed: of the environments
     :raises ValueError: if no program of so many terms was found
     """
+    given, (variations, episodes) = variations, spread(env_id, variations, episodes)
     states, rows = visited(program, env_id, variations, episodes, seed)
     success, steps = success_and_steps(rows)
     cap = max(1, math.ceil(PATIENCE * max(row.steps_mean for row in rows)))  # bad programs are not waited for
@@ -311,11 +217,12 @@ def prune(
     def good_enough(success_rate: float, steps_mean: float) -> bool:
         return success_rate >= success - success_tolerance and steps_mean <= steps * (1 + steps_tolerance)
 
+    make_pruner = DiscretePruner if program.action.kind == "discrete" else BoxPruner
     notes: list[str] = []
     if len(set(states.branches.tolist())) > 1:
         notes.append("conditions stay as they are")
     for tied in [True, False] if symmetries else [False]:
-        curve, best = pareto(Pruner(program, states, symmetries if tied else ()), measure, good_enough)
+        curve, best = pareto(make_pruner(program, states, symmetries if tied else ()), measure, good_enough)
         if n_terms is not None:
             best = next((point for point in curve if point.terms == n_terms), None)
             if best is None:
@@ -327,7 +234,7 @@ def prune(
                 return found
             if reason := why_not(best.program):
                 return dataclasses.replace(found, notes=(*found.notes, f"it was not trained on: {reason}"))
-            train = partial(finetune, env_id=env_id, variations=variations, n_timesteps=finetune_for, seed=seed)
+            train = partial(finetune, env_id=env_id, variations=given, n_timesteps=finetune_for, seed=seed)
             return _finetuned(
                 found, partial(train, symmetries=symmetries if tied else ()), finetune_for, measure, good_enough
             )
