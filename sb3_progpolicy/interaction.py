@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, is_vecenv_wr
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from typing_extensions import deprecated
 
+from sb3_progpolicy.names import Names, readable_names
 from sb3_progpolicy.spaces import action_spec, encode_actions, interaction_space
 
 
@@ -110,29 +111,21 @@ def appends_history(venv: VecEnv) -> bool:
     return is_vecenv_wrapped(venv, VecInteractionHistory) or any(venv.env_is_wrapped(InteractionHistory))
 
 
-def program_names(venv: VecEnv) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def program_names(venv: VecEnv) -> Names:
     """Return readable names of a program's inputs and outputs.
 
-    They come from the environment's ``observation_names`` and ``action_names``, where it has them.
+    See :func:`~sb3_progpolicy.names.readable_names`.
 
     :param venv: the environments a program is trained in
     :return: one name per number of X, one per controller output
     """
     spec = action_spec(venv.action_space)
-    history = spec.interaction_size if appends_history(venv) else 0
-    n_observations = int(np.prod(venv.observation_space.shape or (0,))) - history
-    observations, actions = (_names(venv, attribute) for attribute in ("observation_names", "action_names"))
-    if len(observations) != n_observations:
-        observations = tuple(f"observation[{i}]" for i in range(n_observations))
-    if len(actions) != spec.n_outputs:
-        actions = tuple(f"action[{i}]" for i in range(spec.n_outputs))
-    if history:
-        remembered = (*(f"previous {name}" for name in actions), "previous reward", "previous done")
-        return (*observations, *remembered), actions
-    return observations, actions
-
-
-def _names(venv: VecEnv, attribute: str) -> tuple[str, ...]:
-    """Return the names that an environment gives, in a list or an array; none where it has none."""
-    names = venv.get_attr(attribute)[0] if venv.has_attr(attribute) else None
-    return () if names is None else tuple(map(str, names))
+    history = appends_history(venv)
+    n_observations = int(np.prod(venv.observation_space.shape or (0,))) - history * spec.interaction_size
+    observations, actions, registered = (
+        venv.get_attr(attribute)[0] if venv.has_attr(attribute) else None
+        for attribute in ("observation_names", "action_names", "spec")
+    )
+    return readable_names(
+        observations, actions, getattr(registered, "id", None), n_observations, spec.n_outputs, history
+    )

@@ -9,6 +9,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_progpolicy import InteractionHistory, VecInteractionHistory
 from sb3_progpolicy.interaction import program_names
+from sb3_progpolicy.names import GYMNASIUM_NAMES, readable_names
 from sb3_progpolicy.spaces import action_spec, encode_actions
 
 ACTION_SPACES = {
@@ -150,6 +151,33 @@ def test_names_come_from_the_environment_or_are_numbered():
     assert inputs[-2:] == ("previous reward", "previous done")
     assert len(inputs) == hanoi.observation_space.shape[0]
     assert outputs[0] == "move 0->1"
-    inputs, outputs = program_names(DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
-    assert inputs == ("observation[0]", "observation[1]", "observation[2]")
-    assert outputs == ("action[0]",)
+
+
+def test_gymnasiums_own_tasks_have_names_too():
+    inputs, outputs = program_names(VecInteractionHistory(DummyVecEnv([lambda: gym.make("MountainCar-v0")])))
+    assert outputs == ("push left", "no push", "push right")
+    history = (*(f"previous {name}" for name in outputs), "previous reward", "previous done")
+    assert inputs == ("position", "velocity", *history)
+
+
+@pytest.mark.parametrize("name", GYMNASIUM_NAMES)
+def test_names_of_gymnasiums_tasks_fit_all_their_versions_that_can_be_made(name):
+    versions = [spec.id for spec in gym.registry.values() if spec.id.rpartition("-v")[0] == name]
+    assert versions
+    for version in versions:
+        try:
+            env = gym.make(version)
+        except gym.error.DependencyNotInstalled:
+            pytest.skip("LunarLander needs box2d")
+        except gym.error.DeprecatedEnv:
+            continue
+        known = GYMNASIUM_NAMES[name]
+        assert len(known.observations) == env.observation_space.shape[0]
+        assert len(known.actions) == action_spec(env.action_space).n_outputs
+
+
+def test_without_names_inputs_and_outputs_are_numbered():
+    names = readable_names(None, None, "Mine-v0", 2, 1, history=False)
+    assert names == (("observation[0]", "observation[1]"), ("action[0]",))
+    # A wrapper has changed how many there are: the names would be those of other numbers.
+    assert readable_names(("a", "b"), None, "Pendulum-v1", 5, 1, history=False).observations[0] == "observation[0]"

@@ -276,7 +276,7 @@ def test_names_are_taken_from_lists_and_arrays_and_none_is_none(names):
     env = DummyVecEnv([lambda: Named(gym.make("Pendulum-v1"))])
     model = ReptilePPO("ProgPolicy", env, **{**SMALL, "batch_size": 8})
     assert model.program().input_names[:3] == (
-        ("a", "b", "c") if names is not None else tuple(f"observation[{i}]" for i in range(3))
+        ("a", "b", "c") if names is not None else ("cos angle", "sin angle", "velocity")
     )
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from progpolicy_envs import find_domain
 from sb3_progpolicy.imitation.rollouts import Variations
+from sb3_progpolicy.names import Names, readable_names
 
 
 def training_variations(env_id: str, tasks: Variations | None) -> tuple[Variations, list[int]]:
@@ -25,20 +26,18 @@ def training_variations(env_id: str, tasks: Variations | None) -> tuple[Variatio
     return variations, [sizes.index(variation[domain.size]) for variation in variations]
 
 
-def names_of(env: Any, n_outputs: int, interaction: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return readable names of a program's inputs and outputs, the environment's own where it has them.
+def names_of(env: Any, n_outputs: int, interaction: bool) -> Names:
+    """Return readable names of a program's inputs and outputs, see :func:`~sb3_progpolicy.names.readable_names`.
 
     :param env: an environment
     :param n_outputs: of a controller
     :param interaction: whether the previous action, reward and done flag are inputs, too
     """
-    n_observations = env.observation_space.shape[0]
-    inputs = tuple(map(str, getattr(env.unwrapped, "observation_names", ())))
-    outputs = tuple(map(str, getattr(env.unwrapped, "action_names", ())))
-    if len(inputs) != n_observations:
-        inputs = tuple(f"observation[{index}]" for index in range(n_observations))
-    if len(outputs) != n_outputs:
-        outputs = tuple(f"action[{index}]" for index in range(n_outputs))
-    if interaction:
-        inputs = (*inputs, *(f"previous {name}" for name in outputs), "previous reward", "previous done")
-    return inputs, outputs
+    return readable_names(
+        getattr(env.unwrapped, "observation_names", None),
+        getattr(env.unwrapped, "action_names", None),
+        getattr(env.spec, "id", None),
+        env.observation_space.shape[0],
+        n_outputs,
+        interaction,
+    )
