@@ -3,9 +3,9 @@
     python benchmarks/ablation.py --env HikingEgo-v0 [--seeds 5] [--episodes 100] [--workers 1] [--variants NAME ...]
 
 Each seed of each variant trains from scratch with ``sb3_progpolicy/hyperparams/reptile_ppo.yml`` but for what
-:data:`VARIANTS` says, and is run on the training and validation variations: crisp, soft and, where actions are discrete,
-simplified. Unseen variations are not looked at. A finished seed is kept in ``runs/`` and one that is interrupted goes on
-from its last checkpoint. Rows of variants that are not asked for stay in the file.
+:func:`variants_of` says, and is run on the training and validation variations: crisp, soft and, where actions are
+discrete, simplified. Unseen variations are not looked at. A finished seed is kept in ``runs/`` and one that is
+interrupted goes on from its last checkpoint. Rows of variants that are not asked for stay in the file.
 
 Writes ``benchmarks/results/ablation_<env>.csv`` and a ``.json`` with command, commit and versions, and prints a table.
 """
@@ -80,7 +80,8 @@ def known_rows(path: Path, asked: Sequence[str]) -> Iterator[Row]:
 
 def show(rows: Sequence[Row]) -> None:
     """Print what the seeds of each variant reach on each set."""
-    table = Table("variant", "set", "semantics", "success: least, median", "steps / planner's, median", "numbers, median")
+    columns = ("success: least, median", "steps / planner's, median", "numbers, median")
+    table = Table("variant", "set", "semantics", *columns)
     for variant, kind, semantics in dict.fromkeys((row["variant"], row["set"], row["semantics"]) for row in rows):
         here = [row for row in rows if (row["variant"], row["set"], row["semantics"]) == (variant, kind, semantics)]
         seeds = sorted({int(row["seed"]) for row in here})

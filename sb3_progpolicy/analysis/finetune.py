@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from sb3_progpolicy.analysis.terms import Floats, symmetric_part
 from sb3_progpolicy.hyperparams import load_hyperparams
 from sb3_progpolicy.programs.program import Program
-from sb3_progpolicy.programs.syntax import Controller, Expression, IfThenElse, ProgramData
+from sb3_progpolicy.programs.syntax import Condition, Controller, Expression, IfThenElse, ProgramData
 from sb3_progpolicy.reptile_ppo.algorithm import ReptilePPO
 from sb3_progpolicy.reptile_ppo.initial import read_initial_program
 
@@ -150,16 +150,20 @@ def with_controllers(program: ProgramData, matrices: Sequence[Floats]) -> Progra
     return with_branches(program, dict(enumerate(matrices)))
 
 
-def with_branches(program: ProgramData, matrices: Mapping[int, Floats]) -> ProgramData:
+def with_branches(
+    program: ProgramData, matrices: Mapping[int, Floats], conditions: Mapping[int, Condition] | None = None
+) -> ProgramData:
     """Return a program of some of a program's branches, with other controllers.
 
-    :param program: whose conditions stay
+    :param program: the original
     :param matrices: weights and constant of controllers, ``(n_outputs, n_inputs + 1)``, by the index of the branch
+    :param conditions: in place of the original's, by index; all others stay
     """
     *others, last = sorted(matrices)
     body: Expression = _controller(matrices[last])
     for index in reversed(others):
-        body = IfThenElse(program.conditions[index], _controller(matrices[index]), body)
+        condition = (conditions or {}).get(index, program.conditions[index])
+        body = IfThenElse(condition, _controller(matrices[index]), body)
     return dataclasses.replace(program, body=body)
 
 

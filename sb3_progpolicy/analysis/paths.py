@@ -33,6 +33,15 @@ class States:
     branches: NDArray[np.int64]
 
 
+def rounded(numbers: Floats, digits: int) -> Floats:
+    """Return numbers with so many significant digits.
+
+    :param numbers: of any shape
+    :param digits: at least 1
+    """
+    return np.array([float(f"{number:.{digits - 1}e}") for number in numbers.ravel().tolist()]).reshape(numbers.shape)
+
+
 class Pruner:
     """Programs of few terms that do nearly what the original does, one for each number of terms.
 
@@ -48,22 +57,23 @@ class Pruner:
         self.program, self.states = program, states
         #: The branches that act at all; the others are dropped.
         self.reached = sorted(set(states.branches.tolist()))
-        self.terms: list[tuple[int, Term]] = [
-            (branch, term)
-            for branch in self.reached
-            for term in terms_of(program, program.action.n_outputs, symmetries)
-        ]
+        each = terms_of(program, program.action.n_outputs, symmetries)
+        self.terms: list[tuple[int, Term]] = [(branch, term) for branch in self.reached for term in each]
         #: What the original's controllers say, ``(n_states, n_outputs)``.
         self.outputs = np.zeros((len(states.inputs), program.action.n_outputs))
         for branch in self.reached:
             here = states.branches == branch
             self.outputs[here] = states.inputs[here] @ matrix_of(program.controllers[branch]).T
-        self._features = [self._feature(branch, term) for branch, term in self.terms]
+        self._rows = {branch: np.flatnonzero(states.branches == branch) for branch in self.reached}
+        inputs = {branch: states.inputs[rows] for branch, rows in self._rows.items()}
+        #: What each term says in the states of its branch; elsewhere it says nothing.
+        self._said = [inputs[branch] @ term.weights.T for branch, term in self.terms]
 
-    def _feature(self, branch: int, term: Term) -> Floats:
-        values = self.states.inputs @ term.weights.T
-        values[self.states.branches != branch] = 0
-        return np.asarray(values)
+    def _feature(self, index: int) -> Floats:
+        """Return what a term says, ``(n_states, n_outputs)``."""
+        values = np.zeros_like(self.outputs)
+        values[self._rows[self.terms[index][0]]] = self._said[index]
+        return values
 
     def path(self, max_terms: int = MAX_TERMS) -> list[tuple[list[int], Floats]]:
         """Return for each number of terms, from 1, which they are and their weights.
@@ -98,7 +108,7 @@ class Pruner:
     def _sum(self, chosen: Sequence[int], weights: Floats) -> Floats:
         total = np.zeros_like(self.outputs)
         for index, weight in zip(chosen, weights, strict=True):
-            total += weight * self._features[index]
+            total[self._rows[self.terms[index][0]]] += weight * self._said[index]
         return total
 
     def make(self, chosen: Sequence[int], weights: Floats) -> ProgramData:
@@ -121,14 +131,14 @@ class BoxPruner(Pruner):
     def __init__(self, program: ProgramData, states: States, symmetries: Sequence[Any]) -> None:
         super().__init__(program, states, symmetries)
         self.low, self.high = np.array(program.action.low), np.array(program.action.high)
-        self._sizes = np.array([(feature**2).sum() for feature in self._features])
+        self._sizes = np.array([(said**2).sum() for said in self._said])
 
     def fit(self, chosen: Sequence[int]) -> Floats:
         """Return least squares weights.
 
         :param chosen: indices of terms
         """
-        matrix = np.stack([self._features[index].ravel() for index in chosen], axis=1)
+        matrix = np.stack([self._feature(index).ravel() for index in chosen], axis=1)
         target = self.outputs.ravel()
         weights = np.zeros(len(chosen))
         low, high = (np.broadcast_to(bound, self.outputs.shape).ravel() for bound in (self.low, self.high))
@@ -145,7 +155,12 @@ class BoxPruner(Pruner):
     def _gains(self, chosen: Sequence[int], weights: Floats) -> Floats:
         outputs = self._sum(chosen, weights)
         residual = np.clip(self.outputs, self.low, self.high) - np.clip(outputs, self.low, self.high)
-        products = np.array([(feature * residual).sum() for feature in self._features])
+        products = np.array(
+            [
+                (said * residual[self._rows[branch]]).sum()
+                for (branch, _), said in zip(self.terms, self._said, strict=True)
+            ]
+        )
         return np.where(self._sizes > 0, products**2 / np.where(self._sizes > 0, self._sizes, 1), 0.0)
 
 
@@ -167,7 +182,7 @@ class DiscretePruner(Pruner):
 
         :param chosen: indices of terms
         """
-        features = np.stack([self._features[index] for index in chosen])  # (n_terms, n_states, n_actions)
+        features = np.stack([self._feature(index) for index in chosen])  # (n_terms, n_states, n_actions)
         weights, ridge = np.zeros(len(chosen)), _RIDGE * len(self._taken)
 
         def loss_of(weights: Floats) -> float:
@@ -193,12 +208,14 @@ class DiscretePruner(Pruner):
         return np.asarray(weights)
 
     def _gains(self, chosen: Sequence[int], weights: Floats) -> Floats:
-        shares = _softmax(self._sum(chosen, weights))
+        all_shares = _softmax(self._sum(chosen, weights))
+        of_branch = {branch: (all_shares[rows], self._taken[rows]) for branch, rows in self._rows.items()}
         gains = np.zeros(len(self.terms))
-        for index, feature in enumerate(self._features):
-            means = (feature * shares).sum(axis=1)
-            variance = float((feature**2 * shares).sum() - (means**2).sum())
-            gradient = float((feature * (self._taken - shares)).sum())
+        for index, ((branch, _), said) in enumerate(zip(self.terms, self._said, strict=True)):
+            shares, taken = of_branch[branch]
+            means = (said * shares).sum(axis=1)
+            variance = float((said**2 * shares).sum() - (means**2).sum())
+            gradient = float((said * (taken - shares)).sum())
             gains[index] = gradient**2 / (variance + _RIDGE * len(self._taken))
         return gains
 

@@ -7,15 +7,16 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from progpolicy_envs import get_domain
 from sb3_progpolicy.analysis.finetune import finetune, matrix_of, why_not, with_controllers
-from sb3_progpolicy.analysis.paths import MAX_TERMS, BoxPruner, DiscretePruner, Pruner, States
+from sb3_progpolicy.analysis.paths import MAX_TERMS, BoxPruner, DiscretePruner, Pruner, States, rounded
 from sb3_progpolicy.analysis.terms import Floats
+from sb3_progpolicy.analysis.thin import Thinner
 from sb3_progpolicy.evaluation import Evaluation, evaluate_program, success_and_steps
 from sb3_progpolicy.programs.syntax import ProgramData
 
@@ -27,6 +28,9 @@ PATIENCE = 4
 _TIMES = 10
 #: Significant digits that are tried, the fewest first.
 _DIGITS = (1, 2, 3)
+
+Measure = Callable[[ProgramData], tuple[float, float]]
+GoodEnough = Callable[[float, float], bool]
 
 
 @dataclass(frozen=True)
@@ -87,19 +91,10 @@ def spread(
     return [variation for variation in variations for _ in range(times)], math.ceil(episodes / times)
 
 
-def rounded(weights: Floats, digits: int) -> Floats:
-    """Return numbers with so many significant digits.
-
-    :param weights: numbers
-    :param digits: at least 1
-    """
-    return np.array([float(f"{weight:.{digits - 1}e}") for weight in weights.tolist()])
-
-
 def pareto(
     pruner: Pruner,
-    measure: Callable[[ProgramData], tuple[float, float]],
-    good_enough: Callable[[float, float], bool],
+    measure: Measure,
+    good_enough: GoodEnough,
     max_terms: int = MAX_TERMS,
 ) -> tuple[list[Point], Point | None]:
     """Return what programs of few terms reach, up to the first that is good enough and cannot lose a term.
@@ -138,8 +133,8 @@ def _rounded_point(
     pruner: Pruner,
     chosen: Sequence[int],
     weights: Floats,
-    measure: Callable[[ProgramData], tuple[float, float]],
-    good_enough: Callable[[float, float], bool],
+    measure: Measure,
+    good_enough: GoodEnough,
 ) -> Point:
     """Return the program with the roundest weights that is good enough, or else with three digits."""
     point: Point | None = None
@@ -217,10 +212,39 @@ def prune(
     def good_enough(success_rate: float, steps_mean: float) -> bool:
         return success_rate >= success - success_tolerance and steps_mean <= steps * (1 + steps_tolerance)
 
+    found, notes = _by_path(program, states, symmetries, measure, good_enough, n_terms)
+    if found is None:
+        found, more = _by_thinning(Thinner(program, states, symmetries), measure, good_enough)
+        notes += more
+    if found is None:
+        found, finetune_for = _Found(Point(0, program, success, steps), (), False), None
+    pruned = Pruned(found.point, found.curve, len(states.inputs), episodes * len(variations), found.tied, tuple(notes))
+    if finetune_for is None:
+        return pruned
+    if reason := why_not(pruned.point.program):
+        return dataclasses.replace(pruned, notes=(*pruned.notes, f"it was not trained on: {reason}"))
+    train = partial(finetune, env_id=env_id, variations=given, n_timesteps=finetune_for, seed=seed)
+    tying = symmetries if pruned.tied else ()
+    return _finetuned(pruned, partial(train, symmetries=tying), finetune_for, measure, good_enough)
+
+
+class _Found(NamedTuple):
+    point: Point
+    curve: tuple[Point, ...]
+    tied: bool
+
+
+def _by_path(
+    program: ProgramData,
+    states: States,
+    symmetries: Sequence[Any],
+    measure: Measure,
+    good_enough: GoodEnough,
+    n_terms: int | None,
+) -> tuple[_Found | None, list[str]]:
+    """Return a program of a few terms, if there is one, and notes."""
     make_pruner = DiscretePruner if program.action.kind == "discrete" else BoxPruner
     notes: list[str] = []
-    if len(set(states.branches.tolist())) > 1:
-        notes.append("conditions stay as they are")
     for tied in [True, False] if symmetries else [False]:
         curve, best = pareto(make_pruner(program, states, symmetries if tied else ()), measure, good_enough)
         if n_terms is not None:
@@ -229,26 +253,58 @@ def prune(
                 known = ", ".join(str(point.terms) for point in curve)
                 raise ValueError(f"n_terms={n_terms} is not accepted; there are programs of {known} terms")
         if best is not None:
-            found = Pruned(best, tuple(curve), len(states.inputs), episodes * len(variations), tied, tuple(notes))
-            if finetune_for is None:
-                return found
-            if reason := why_not(best.program):
-                return dataclasses.replace(found, notes=(*found.notes, f"it was not trained on: {reason}"))
-            train = partial(finetune, env_id=env_id, variations=given, n_timesteps=finetune_for, seed=seed)
-            return _finetuned(
-                found, partial(train, symmetries=symmetries if tied else ()), finetune_for, measure, good_enough
-            )
+            if len(set(states.branches.tolist())) > 1:
+                notes.append("conditions stay as they are")
+            return _Found(best, tuple(curve), tied), notes
         notes.append(f"no {'tied ' if tied else ''}program of up to {MAX_TERMS} terms is as good")
-    original = Point(0, program, success, steps)
-    return Pruned(original, tuple(curve), len(states.inputs), episodes * len(variations), False, tuple(notes))
+    return None, notes
+
+
+def _by_thinning(thinner: Thinner, measure: Measure, good_enough: GoodEnough) -> tuple[_Found | None, list[str]]:
+    """Return a program without the numbers that matter least, if there is one, and notes."""
+    curve, n_pieces = thin(thinner, measure, good_enough)
+    if n_pieces == len(thinner.pieces):
+        return None, ["none of its numbers can be left out"]
+    best = next(point for point in curve if point.terms == n_pieces)
+    for digits in _DIGITS:
+        program = thinner.make(n_pieces, digits)
+        point = Point(n_pieces, program, *measure(program))
+        if good_enough(point.success_rate, point.steps_mean):
+            best = point
+            break
+    notes = ["the numbers that matter least were left out, those of conditions too; the others are as they were learnt"]
+    return _Found(best, tuple(sorted(curve, key=lambda point: point.terms)), thinner.tied), notes
+
+
+def thin(thinner: Thinner, measure: Measure, good_enough: GoodEnough) -> tuple[list[Point], int]:
+    """Look for the program of the fewest of a program's own numbers.
+
+    More numbers are taken to be no worse, so that halving the interval finds it.
+
+    :param thinner: makes them
+    :param measure: returns success rate and mean steps of a program on the training variations
+    :param good_enough: whether these are within the tolerance
+    :return: what was tried, and how many numbers to take: all, if fewer are never good enough
+    """
+    points = []
+    low, high = 0, len(thinner.pieces)  # of which low is not good enough and high is
+    while high - low > 1:
+        middle = (low + high) // 2
+        program = thinner.make(middle)
+        points.append(Point(middle, program, *measure(program)))
+        if good_enough(points[-1].success_rate, points[-1].steps_mean):
+            high = middle
+        else:
+            low = middle
+    return points, high
 
 
 def _finetuned(
     pruned: Pruned,
     train: Callable[[ProgramData], tuple[ProgramData, str]],
     n_timesteps: int,
-    measure: Callable[[ProgramData], tuple[float, float]],
-    good_enough: Callable[[float, float], bool],
+    measure: Measure,
+    good_enough: GoodEnough,
 ) -> Pruned:
     """Return what training makes of a pruned program, with the roundest numbers that make it better, or the pruned one.
 
@@ -262,9 +318,7 @@ def _finetuned(
     trained, learned_by = train(before.program)
     for digits in _DIGITS:
         matrices = [matrix_of(controller) for controller in trained.controllers]
-        candidate = with_controllers(
-            trained, [rounded(matrix.ravel(), digits).reshape(matrix.shape) for matrix in matrices]
-        )
+        candidate = with_controllers(trained, [rounded(matrix, digits) for matrix in matrices])
         success, steps = measure(candidate)
         better = (success, -steps) > (before.success_rate, -before.steps_mean)
         kept = good_enough(success, steps) or not good_enough(before.success_rate, before.steps_mean)

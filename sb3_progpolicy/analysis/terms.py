@@ -36,6 +36,8 @@ def terms_of(
     :param grids: blocks of inputs that count as functions of row and column
     """
     width = program.n_inputs + 1
+    if not symmetries and not grids:
+        return [Term(pattern.reshape(n_outputs, width)) for pattern in np.eye(n_outputs * width)]
     group = [(_on_inputs(program, one), _on_outputs(one, n_outputs)) for one in group_of(symmetries)]
     found: list[Term] = []
     span = np.zeros((0, n_outputs * width))

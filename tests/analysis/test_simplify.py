@@ -11,10 +11,13 @@ from progpolicy_envs import DOMAINS
 from progpolicy_envs.symmetry import group_of
 from sb3_progpolicy import load_pretrained
 from sb3_progpolicy.analysis.integer import fewest_terms
+from sb3_progpolicy.analysis.paths import States
+from sb3_progpolicy.analysis.prune import visited
 from sb3_progpolicy.analysis.rules import count_numbers
 from sb3_progpolicy.analysis.simplify import simplify
 from sb3_progpolicy.analysis.situations import good_actions, meet
-from sb3_progpolicy.analysis.terms import terms_of
+from sb3_progpolicy.analysis.terms import symmetric_part, terms_of
+from sb3_progpolicy.analysis.thin import Thinner
 from sb3_progpolicy.analysis.verify import verify
 from sb3_progpolicy.cli import run
 from sb3_progpolicy.evaluation import evaluate_program
@@ -241,6 +244,46 @@ def test_number_of_terms_can_be_asked_for_where_success_and_steps_are_kept():
     three = simplify(load_pretrained("Hanoi-v0"), equally_good="outcome", episodes=5, n_terms=3)
     assert three.terms_after == 3
     assert min(point.success_rate for point in three.curve if point.terms == 3) < 1
+
+
+def test_where_few_terms_do_not_do_the_numbers_that_matter_least_are_left_out(monkeypatch):
+    import sb3_progpolicy.analysis.prune as module
+
+    monkeypatch.setattr(module, "_by_path", lambda *arguments: (None, []))
+    original = load_pretrained("Hanoi-v0")
+    found = simplify(original, equally_good="outcome", episodes=5)
+    assert (found.symmetry, found.notes[0][:30]) == ("pegs", "the numbers that matter least ")
+    assert count_numbers(found.program) < 108 / 2
+    for row in evaluate_program(found.program, "Hanoi-v0", [{"n_discs": n_discs} for n_discs in (1, 2, 3, 4)]):
+        assert row.ratio == 1
+    matrix = np.array(found.program.controllers[0].weights)
+    assert ((matrix == 0) | (np.sign(matrix) == np.sign(original.controllers[0].weights))).all()
+
+
+def test_all_numbers_make_the_original_and_ties_are_kept():
+    noisy, rng = right_hand(0.2), np.random.default_rng(0)
+    inputs = np.column_stack([rng.normal(size=(200, noisy.n_inputs)), np.ones(200)])
+    states, symmetries = States(inputs, np.zeros(200, dtype=int)), DOMAINS["HikingEgo-v0"].symmetries
+    thinner = Thinner(noisy, states, symmetries)
+    assert thinner.tied
+    assert thinner.make(len(thinner.pieces)) == noisy
+    assert [piece.share for piece in thinner.pieces] == sorted((p.share for p in thinner.pieces), reverse=True)
+    few = np.column_stack([(c := thinner.make(5).controllers[0]).weights, c.bias])
+    np.testing.assert_allclose(symmetric_part(noisy, few, symmetries), few, atol=1e-12)
+    assert np.count_nonzero(few[:, :-1]) == 5 * 4
+    untied = dataclasses.replace(noisy, body=Controller(noisy.body.weights, (1.0, 0.0, 0.0, 0.0)))
+    assert not Thinner(untied, states, symmetries).tied
+
+
+def test_conditions_are_thinned_and_branches_that_never_act_go():
+    original = load_pretrained("Hiking-v0")
+    states, _ = visited(original, "Hiking-v0", [{"n_stars": 1}] * 4, 5, seed=0)
+    thinner = Thinner(original, states, ())
+    some = thinner.make(100)
+    assert len(some.controllers) == len(set(states.branches.tolist())) <= len(original.controllers)
+    assert count_numbers(some) <= 100 + len(some.conditions) + 4 * len(some.controllers)
+    kept = sum(piece.of_condition for piece in thinner.pieces[:100])
+    assert sum(np.count_nonzero(condition.readout) for condition in some.conditions) == kept
 
 
 def test_continuous_actions_have_no_equally_good_ones():
