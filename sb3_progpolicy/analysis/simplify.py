@@ -105,8 +105,8 @@ def simplify(
     those first that bring the actions nearest to the original's, fitted on the states that the original meets (least
     squares; for Discrete actions the likelihood of its choices) and rounded, until success and steps on the training
     variations are within a tolerance; then those are left out again without which they still are. Branches that never
-    act are dropped, conditions stay as they are. If 40 terms do not do, the numbers that matter least are left out, those
-    of affine conditions too, and the others stay as they are but for rounding. If asked, PPO then trains the numbers of
+    act are dropped, conditions stay as they are. If 40 terms do not do, the numbers that matter least are left out,
+    those of affine conditions too, and the others stay as they are but for rounding. If asked, PPO then trains the numbers of
     continuous controllers that are left; what comes of it is taken if success and steps on the training variations are
     better.
 
