@@ -106,9 +106,9 @@ def simplify(
     squares; for Discrete actions the likelihood of its choices) and rounded, until success and steps on the training
     variations are within a tolerance; then those are left out again without which they still are. Branches that never
     act are dropped, conditions stay as they are. If 40 terms do not do, the numbers that matter least are left out,
-    those of affine conditions too, and the others stay as they are but for rounding. If asked, PPO then trains the numbers of
-    continuous controllers that are left; what comes of it is taken if success and steps on the training variations are
-    better.
+    those of affine conditions too, and the others stay as they are but for rounding. If asked, PPO then trains the
+    numbers of continuous controllers that are left; what comes of it is taken if success and steps on the training
+    variations are better.
 
     :param program: acts in a Discrete space or a Box
     :param env_id: id of a planning domain; by default the one in the program's metadata
