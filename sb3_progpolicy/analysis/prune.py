@@ -137,17 +137,16 @@ def _rounded_point(
     good_enough: GoodEnough,
 ) -> Point:
     """Return the program with the roundest weights that is good enough, or else with three digits."""
-    point: Point | None = None
-    for digits in _DIGITS:
+
+    def point_of(digits: int) -> Point:
         program = pruner.make(chosen, rounded(weights, digits))
-        success, steps = measure(program)
-        point = Point(len(chosen), program, success, steps)
-        if good_enough(success, steps):
-            return point
-        if not math.isfinite(steps):
-            break
-    assert point is not None
-    return point
+        return Point(len(chosen), program, *measure(program))
+
+    exact = point_of(_DIGITS[-1])
+    if not good_enough(exact.success_rate, exact.steps_mean):
+        return exact
+    rounder = (point_of(digits) for digits in _DIGITS[:-1])
+    return next((point for point in rounder if good_enough(point.success_rate, point.steps_mean)), exact)
 
 
 @dataclass(frozen=True)
