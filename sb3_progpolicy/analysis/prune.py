@@ -95,14 +95,14 @@ def pareto(
     pruner: Pruner,
     measure: Measure,
     good_enough: GoodEnough,
-    max_terms: int = MAX_TERMS,
+    whole: bool = False,
 ) -> tuple[list[Point], Point | None]:
     """Return what programs of few terms reach, up to the first that is good enough and cannot lose a term.
 
     :param pruner: makes them
     :param measure: returns success rate and mean steps of a program on the training variations
     :param good_enough: whether these are within the tolerance
-    :param max_terms: how many terms to try
+    :param whole: measure smaller programs even if the one of :data:`MAX_TERMS` terms is not good enough
     :return: the curve, and the point to take; ``None`` if none is good enough
     """
     curve: list[Point] = []
@@ -110,7 +110,12 @@ def pareto(
     def point_of(chosen: Sequence[int], weights: Floats) -> Point:
         return _rounded_point(pruner, chosen, weights, measure, good_enough)
 
-    for chosen, weights in pruner.path(max_terms):
+    path = pruner.path()
+    if path and not whole:
+        largest = point_of(*path[-1])
+        if not good_enough(largest.success_rate, largest.steps_mean):
+            return [largest], None
+    for chosen, weights in path:
         best = point_of(chosen, weights)
         curve.append(best)
         if not good_enough(best.success_rate, best.steps_mean):
@@ -245,7 +250,9 @@ def _by_path(
     make_pruner = DiscretePruner if program.action.kind == "discrete" else BoxPruner
     notes: list[str] = []
     for tied in [True, False] if symmetries else [False]:
-        curve, best = pareto(make_pruner(program, states, symmetries if tied else ()), measure, good_enough)
+        curve, best = pareto(
+            make_pruner(program, states, symmetries if tied else ()), measure, good_enough, n_terms is not None
+        )
         if n_terms is not None:
             best = next((point for point in curve if point.terms == n_terms), None)
             if best is None:
