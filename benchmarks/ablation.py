@@ -5,7 +5,7 @@
 Each seed of each variant trains from scratch with ``sb3_progpolicy/hyperparams/reptile_ppo.yml`` but for what
 :func:`variants_of` says, and is run on the training and validation variations: crisp, soft and, where actions are
 discrete, simplified. Unseen variations are not looked at. A finished seed is kept in ``runs/`` and one that is
-interrupted goes on from its last checkpoint. Rows of variants that are not asked for stay in the file.
+interrupted goes on from its last checkpoint. Rows of variants that are not asked for stay in the file, each with its commit.
 
 Writes ``benchmarks/results/ablation_<env>.csv`` and a ``.json`` with command, commit and versions, and prints a table.
 """
@@ -111,7 +111,7 @@ def main() -> None:
     asked = options.variants or list(variants)
     if strange := [name for name in asked if name not in variants]:
         parser.error(f"--variants {', '.join(strange)} is not accepted; there are {', '.join(variants)}")
-    commit()  # of the code that is loaded now
+    loaded = commit()  # of the code that is loaded now
     simplified = options.env == "HikingEgo-v0"
     name = f"ablation_{options.env.partition('-')[0].lower()}"
     path = RESULTS / f"{name}.csv"
@@ -124,8 +124,8 @@ def main() -> None:
     rows: list[Row] = list(known_rows(path, asked))
     with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
         for found in pool.imap(run_variant, jobs):
-            rows += found
-            write_results(name, ("variant", *COLUMNS), rows, {})
+            rows += [{**row, "commit": loaded} for row in found]
+            write_results(name, ("variant", *COLUMNS, "commit"), rows, {})
             print(f"{found[0]['variant']}, seed {found[0]['seed']}: {_first(found)}", flush=True)
     show(rows)
 

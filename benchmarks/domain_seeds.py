@@ -1,7 +1,7 @@
 """Several seeds of a domain, or of any environment: train on its training variations, then run the programs.
 
     python benchmarks/domain_seeds.py --env HikingEgo-v0 [--seeds 10] [--episodes 100] [--workers 1]
-    python benchmarks/domain_seeds.py --env HikingEgo-v0 --final --ship
+    python benchmarks/domain_seeds.py --env HikingEgo-v0 --final --simplify --ship
     python benchmarks/domain_seeds.py --env Acrobot-v1
 
 Each seed trains from scratch with ``sb3_progpolicy/hyperparams/reptile_ppo.yml``, the same for all. Its program is
@@ -11,8 +11,9 @@ simplified: few terms with the same success and steps on the training variations
 --ship takes the simplified one of the median seed. A finished seed is kept in ``runs/`` and one that is interrupted
 goes on from its last checkpoint.
 
-Writes ``benchmarks/results/<name>.csv``, a picture of the crisp programs, and a ``.json`` with command, commit and
-versions. Says which seed is the median by what was reached in training; --ship puts it into the package.
+Writes ``benchmarks/results/<name>.csv``, a picture of the crisp programs (simplified ones if asked for), and a
+``.json`` with command, commit and versions. Says which seed is the median by what was reached in training; --ship puts
+it into the package.
 """
 
 from __future__ import annotations

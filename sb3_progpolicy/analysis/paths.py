@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +14,7 @@ from sb3_progpolicy.analysis.finetune import matrix_of, with_branches
 from sb3_progpolicy.analysis.terms import Floats, Term, terms_of
 from sb3_progpolicy.programs.syntax import ProgramData
 
+#: Terms of the largest program that is made.
 MAX_TERMS = 40
 _REFITS = 8
 #: Weights of preferences are drawn to 0 by this much for each state: where states can be told apart, they would grow
@@ -42,7 +44,7 @@ def rounded(numbers: Floats, digits: int) -> Floats:
     return np.array([float(f"{number:.{digits - 1}e}") for number in numbers.ravel().tolist()]).reshape(numbers.shape)
 
 
-class Pruner:
+class Pruner(ABC):
     """Programs of few terms that do nearly what the original does, one for each number of terms.
 
     Terms are added one by one, the one first that promises to bring the actions nearest to the original's; all weights
@@ -54,7 +56,7 @@ class Pruner:
     """
 
     def __init__(self, program: ProgramData, states: States, symmetries: Sequence[Any]) -> None:
-        self.program, self.states = program, states
+        self.program = program
         #: The branches that act at all; the others are dropped.
         self.reached = sorted(set(states.branches.tolist()))
         each = terms_of(program, program.action.n_outputs, symmetries)
@@ -75,15 +77,12 @@ class Pruner:
         values[self._rows[self.terms[index][0]]] = self._said[index]
         return values
 
-    def path(self, max_terms: int = MAX_TERMS) -> list[tuple[list[int], Floats]]:
-        """Return for each number of terms, from 1, which they are and their weights.
-
-        :param max_terms: the largest number
-        """
+    def path(self) -> list[tuple[list[int], Floats]]:
+        """Return for each number of terms, from 1 to :data:`MAX_TERMS`, which they are and their weights."""
         chosen: list[int] = []
         path = []
         weights = np.zeros(0)
-        for _ in range(min(max_terms, len(self.terms))):
+        for _ in range(min(MAX_TERMS, len(self.terms))):
             gains = self._gains(chosen, weights)
             gains[chosen] = -1.0
             best = int(np.argmax(gains))
@@ -94,16 +93,16 @@ class Pruner:
             path.append((chosen, weights))
         return path
 
+    @abstractmethod
     def fit(self, chosen: Sequence[int]) -> Floats:
         """Return the weights of some terms that bring the actions nearest to the original's.
 
         :param chosen: indices of terms
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def _gains(self, chosen: Sequence[int], weights: Floats) -> Floats:
         """Return for each term what it would bring beside those that are chosen."""
-        raise NotImplementedError
 
     def _sum(self, chosen: Sequence[int], weights: Floats) -> Floats:
         total = np.zeros_like(self.outputs)

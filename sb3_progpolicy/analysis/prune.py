@@ -26,7 +26,7 @@ MAX_STATES = 20_000
 PATIENCE = 4
 #: How many times a variation is played at the same time.
 _TIMES = 10
-#: Significant digits that are tried, the fewest first.
+#: Significant digits that are tried; the most are what has to do first.
 _DIGITS = (1, 2, 3)
 
 Measure = Callable[[ProgramData], tuple[float, float]]

@@ -139,6 +139,16 @@ def simplify(
     if program.action.kind not in ("discrete", "box"):
         raise ValueError(f"{program.action.kind} actions are not accepted here; Discrete and Box ones are")
     box = program.action.kind == "box"
+    by_outcome = box or equally_good == "outcome"
+    if box and equally_good == "planner":
+        raise ValueError("equally_good='planner' is not accepted for Box actions; it is for Discrete ones")
+    if not box and finetune is not None:
+        raise ValueError(f"finetune={finetune} is not accepted for Discrete actions; it is for Box ones")
+    if not by_outcome and n_terms is not None:
+        raise ValueError(
+            f"n_terms={n_terms} is not accepted for Discrete actions with equally_good={equally_good!r}, of which the "
+            "fewest are found; it is with equally_good='outcome'"
+        )
     refuse_wrappers("the program", program.metadata.get("wrappers", ()))
     domain = get_domain(env_id)
     variations = domain.trained if variations is None else variations
@@ -155,11 +165,7 @@ def simplify(
         seed=seed,
     )
     original, program = program, switched.program
-    if box and equally_good == "planner":
-        raise ValueError("equally_good='planner' is not accepted for Box actions; it is for Discrete ones")
-    if not box and finetune is not None:
-        raise ValueError(f"finetune={finetune} is not accepted for Discrete actions; it is for Box ones")
-    if box or equally_good == "outcome":
+    if by_outcome:
         pruned = prune(
             program,
             env_id,
@@ -173,11 +179,6 @@ def simplify(
             seed=seed,
         )
         return _of_pruned(original, pruned, domain, began)
-    if n_terms is not None:
-        raise ValueError(
-            f"n_terms={n_terms} is not accepted for Discrete actions with equally_good={equally_good!r}, of which the "
-            "fewest are found; it is with equally_good='outcome'"
-        )
     planner = equally_good == "planner"
     situations = meet(program, env_id, variations, n_starts, planner, seed)
     if not len(situations.inputs):

@@ -45,7 +45,8 @@ def simplify(
         int | None, typer.Option("--finetune", min=1, help="continuous actions: then train it on for so many steps")
     ] = None,
     curve: Annotated[
-        Path | None, typer.Option("--curve", help="the same: .csv or .png of terms against success and steps")
+        Path | None,
+        typer.Option("--curve", help="continuous actions or outcome: .csv or .png, success and steps by terms"),
     ] = None,
     env: Annotated[str | None, typer.Option("--env", help="another environment than it was trained in")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="a JSON object on stdout, nothing else")] = False,
