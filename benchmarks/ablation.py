@@ -5,7 +5,8 @@
 Each seed of each variant trains from scratch with ``sb3_progpolicy/hyperparams/reptile_ppo.yml`` but for what
 :func:`variants_of` says, and is run on the training and validation variations: crisp, soft and, where actions are
 discrete, simplified. Unseen variations are not looked at. A finished seed is kept in ``runs/`` and one that is
-interrupted goes on from its last checkpoint. Rows of variants that are not asked for stay in the file, each with its commit.
+interrupted goes on from its last checkpoint. Rows of variants that are not asked for stay in the file. Each row names
+its commit.
 
 Writes ``benchmarks/results/ablation_<env>.csv`` and a ``.json`` with command, commit and versions, and prints a table.
 """
