@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import multiprocessing
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -25,7 +24,7 @@ import numpy as np
 from domain_seeds import COLUMNS, Row, run_seed
 from rich.console import Console
 from rich.table import Table
-from study import RESULTS, commit, write_results
+from study import RESULTS, commit, pool, write_results
 
 from sb3_progpolicy.hyperparams import load_hyperparams
 
@@ -122,10 +121,11 @@ def main() -> None:
         for variant in asked
         for folder in [Path("runs") / name / variant.replace(" ", "_")]
     ]
-    rows: list[Row] = list(known_rows(path, asked))
-    with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
-        for found in pool.imap(run_variant, jobs):
+    order, rows = list(variants), list(known_rows(path, asked))
+    with pool(options.workers) as workers:
+        for found in workers.imap_unordered(run_variant, jobs):
             rows += [{**row, "commit": loaded} for row in found]
+            rows.sort(key=lambda row: (order.index(row["variant"]), int(row["seed"])))
             write_results(name, ("variant", *COLUMNS, "commit"), rows, {})
             print(f"{found[0]['variant']}, seed {found[0]['seed']}: {_first(found)}", flush=True)
     show(rows)

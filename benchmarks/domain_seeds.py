@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import argparse
 import io
-import multiprocessing
 import shutil
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -28,7 +27,7 @@ from typing import Any
 
 import numpy as np
 from rich.progress import track
-from study import RESULTS, commit, overrides_from, train, write_results
+from study import RESULTS, commit, overrides_from, pool, train, write_results
 
 import sb3_progpolicy.pretrained
 from progpolicy_envs import find_domain
@@ -238,8 +237,8 @@ def main() -> None:
     folder = Path("runs") / name
     common = (folder, overrides, options.episodes, options.final, options.simplify)
     jobs = [(options.env, seed, *common) for seed in range(options.seeds)]
-    with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
-        done = track(pool.imap(run_seed, jobs), "Seeds", total=len(jobs))
+    with pool(options.workers) as workers:
+        done = track(workers.imap(run_seed, jobs), "Seeds", total=len(jobs))
         rows = [row for seed_rows in done for row in seed_rows]
     write_results(name, COLUMNS, rows, overrides)
     kind = run_at_last(rows)[0]["semantics"]

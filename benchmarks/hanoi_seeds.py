@@ -13,13 +13,12 @@ from __future__ import annotations
 
 import argparse
 import io
-import multiprocessing
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from rich.progress import track
-from study import RESULTS, overrides_from, train, write_results
+from study import RESULTS, overrides_from, pool, train, write_results
 
 from sb3_progpolicy.evaluation import Evaluation, evaluate_program
 from sb3_progpolicy.programs import Program
@@ -128,8 +127,8 @@ def main() -> None:
     options = parser.parse_args()
     overrides = overrides_from(options.hyperparams)
     jobs = [(seed, Path("runs") / options.name, overrides) for seed in range(options.seeds)]
-    with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
-        done = track(pool.imap(run_seed, jobs), "Seeds", total=len(jobs))
+    with pool(options.workers) as workers:
+        done = track(workers.imap(run_seed, jobs), "Seeds", total=len(jobs))
         rows = [row for seed_rows in done for row in seed_rows]
     write_results(options.name, COLUMNS, rows, overrides)
     plot(options.name, rows)

@@ -6,6 +6,8 @@ import csv
 import hashlib
 import io
 import json
+import multiprocessing
+import os
 import platform
 import shutil
 import subprocess
@@ -14,6 +16,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
+from multiprocessing.pool import Pool
 from pathlib import Path
 from typing import Any
 
@@ -99,10 +102,42 @@ class _Clock(BaseCallback):
         return True
 
 
+def pool(workers: int) -> Pool:
+    """Return processes to train in, each with a core of its own where there are enough.
+
+    A training then starts no processes for its environments, which would only be in the way of the others.
+
+    :param workers: number of processes
+    """
+    context = multiprocessing.get_context("spawn")
+    if workers == 1 or not hasattr(os, "sched_setaffinity"):
+        return context.Pool(workers)
+    cores = context.Queue()
+    for core in (available := sorted(os.sched_getaffinity(0))):
+        cores.put(core)
+    for place in range(workers - len(available)):
+        cores.put(available[place % len(available)])
+    return context.Pool(workers, _keep_to_one_core, (cores,))
+
+
+def _keep_to_one_core(cores: multiprocessing.Queue[int]) -> None:
+    os.sched_setaffinity(0, {cores.get()})
+
+
 @cache
 def commit() -> str:
-    """Return the commit that was checked out when this was first asked, before a long study."""
-    return subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
+    """Return the commit that was checked out when this was first asked, before a long study.
+
+    In a copy of the files without a repository it is what the environment variable ``PROGPOLICY_COMMIT`` says.
+
+    :raises RuntimeError: if neither is there: results have to name their commit
+    """
+    asked = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
+    if found := asked.stdout.strip() or os.environ.get("PROGPOLICY_COMMIT"):
+        return found
+    raise RuntimeError(
+        f"the commit is not known ({asked.stderr.strip()}); run this in a clone, or set PROGPOLICY_COMMIT to it"
+    )
 
 
 def write_results(
