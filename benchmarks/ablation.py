@@ -3,10 +3,10 @@
     python benchmarks/ablation.py --env HikingEgo-v0 [--seeds 5] [--episodes 100] [--workers 1] [--variants NAME ...]
 
 Each seed of each variant trains from scratch with ``sb3_progpolicy/hyperparams/reptile_ppo.yml`` but for what
-:func:`variants_of` says, and is run on the training and validation variations: crisp, soft and, where actions are
-discrete, simplified. Unseen variations are not looked at. A finished seed is kept in ``runs/`` and one that is
-interrupted goes on from its last checkpoint. Rows of variants that are not asked for stay in the file. Each row names
-its commit.
+:func:`variants_of` says, and is run on the training and validation variations, crisp and soft. Unseen variations are
+not looked at. A finished seed is kept in ``runs/`` and one that is interrupted goes on from its last checkpoint. What
+is in the file for the same settings and number of episodes is not done again, and rows of variants that are not asked
+for stay. Each row names its commit.
 
 Writes ``benchmarks/results/ablation_<env>.csv`` and a ``.json`` with command, commit and versions, and prints a table.
 """
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import argparse
 import csv
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -24,8 +24,9 @@ import numpy as np
 from domain_seeds import COLUMNS, Row, run_seed
 from rich.console import Console
 from rich.table import Table
-from study import RESULTS, commit, pool, write_results
+from study import RESULTS, commit, pool, settings_of, write_results
 
+from sb3_progpolicy.experiment.config import make_config
 from sb3_progpolicy.hyperparams import load_hyperparams
 
 ALL = "as shipped"
@@ -67,17 +68,18 @@ def variants_of(env_id: str) -> Mapping[str, Mapping[str, Any]]:
     return {name: {**shorter, **changes} for name, changes in variants.items()}
 
 
-def run_variant(job: tuple[str, tuple[Any, ...]]) -> list[Row]:
+def run_variant(job: tuple[str, str, tuple[Any, ...]]) -> list[Row]:
     """Train and evaluate one seed of a variant."""
-    variant, arguments = job
-    return [{"variant": variant, **row} for row in run_seed(arguments)]  # type: ignore[arg-type]
+    variant, settings, arguments = job
+    return [{"variant": variant, **row, "settings": settings} for row in run_seed(arguments)]  # type: ignore[arg-type]
 
 
-def known_rows(path: Path, asked: Sequence[str]) -> Iterator[Row]:
-    """Read the rows of the variants that are not asked for now."""
-    if path.exists():
-        with path.open(newline="") as file:
-            yield from (row for row in csv.DictReader(file) if row["variant"] not in asked)
+def known_rows(path: Path) -> list[Row]:
+    """Read the rows that are there."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def show(rows: Sequence[Row]) -> None:
@@ -112,21 +114,24 @@ def main() -> None:
     if strange := [name for name in asked if name not in variants]:
         parser.error(f"--variants {', '.join(strange)} is not accepted; there are {', '.join(variants)}")
     loaded = commit()  # of the code that is loaded now
-    simplified = options.env == "HikingEgo-v0"
     name = f"ablation_{options.env.partition('-')[0].lower()}"
-    path = RESULTS / f"{name}.csv"
-    jobs = [
-        (variant, (options.env, seed, folder, dict(variants[variant]), options.episodes, False, simplified))
-        for seed in range(options.seeds)
-        for variant in asked
-        for folder in [Path("runs") / name / variant.replace(" ", "_")]
-    ]
-    order, rows = list(variants), list(known_rows(path, asked))
+    path, order = RESULTS / f"{name}.csv", list(variants)
+    jobs, wanted = [], set()
+    for seed, variant in product(range(options.seeds), asked):
+        overrides, folder = dict(variants[variant]), Path("runs") / name / variant.replace(" ", "_")
+        _, settings = settings_of(make_config("reptile_ppo", options.env, seed, overrides=overrides))
+        jobs.append((variant, settings, (options.env, seed, folder, overrides, options.episodes, False, False)))
+        wanted.add((variant, str(seed), settings, str(options.episodes)))
+    known = known_rows(path)
+    done = {tuple(row[key] for key in ("variant", "seed", "settings", "episodes")) for row in known} & wanted
+    kept = {(variant, seed) for variant, seed, _, _ in done}
+    rows: list[Row] = [row for row in known if row["variant"] not in asked or (row["variant"], row["seed"]) in kept]
+    left = [job for job in jobs if (job[0], str(job[2][1])) not in kept]
     with pool(options.workers) as workers:
-        for found in workers.imap_unordered(run_variant, jobs):
+        for found in workers.imap_unordered(run_variant, left):
             rows += [{**row, "commit": loaded} for row in found]
             rows.sort(key=lambda row: (order.index(row["variant"]), int(row["seed"])))
-            write_results(name, ("variant", *COLUMNS, "commit"), rows, {})
+            write_results(name, ("variant", *COLUMNS, "settings", "commit"), rows, {})
             print(f"{found[0]['variant']}, seed {found[0]['seed']}: {_first(found)}", flush=True)
     show(rows)
 

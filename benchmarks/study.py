@@ -23,7 +23,7 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_progpolicy.experiment.config import make_config
+from sb3_progpolicy.experiment.config import RunConfig, make_config
 from sb3_progpolicy.experiment.folder import CONFIG, describe_run
 from sb3_progpolicy.experiment.run import TrainingOptions, build_model, resume
 from sb3_progpolicy.experiment.run import train as train_run
@@ -54,11 +54,10 @@ def train(env_id: str, seed: int, folder: Path, overrides: dict[str, Any]) -> Pr
     """
     config = make_config("reptile_ppo", env_id, seed, overrides=overrides, device="cpu")
     path = folder / f"seed_{seed}.json"
-    settings = json.loads(json.dumps(dict(config.hyperparams)))
+    settings, digest = settings_of(config)
     if path.exists() and (program := Program.load(path)).metadata.get("hyperparams") == settings:
         return program
     th.set_num_threads(1)
-    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
     run, clock = folder / f"seed_{seed}_{digest}", _Clock(folder / f"seed_{seed}_{digest}" / "processor_seconds")
     if (run / CONFIG).exists():
         model, _ = resume(run)
@@ -74,6 +73,12 @@ def train(env_id: str, seed: int, folder: Path, overrides: dict[str, Any]) -> Pr
     program.save(path)
     shutil.rmtree(run)
     return program
+
+
+def settings_of(config: RunConfig) -> tuple[dict[str, Any], str]:
+    """Return all hyperparameters of a training, and eight hexadecimal digits that tell them from others."""
+    settings = json.loads(json.dumps(dict(config.hyperparams)))
+    return settings, hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
 
 
 class _Clock(BaseCallback):
