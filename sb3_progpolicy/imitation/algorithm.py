@@ -18,8 +18,9 @@ from sb3_progpolicy.imitation.learner import Learner, Settings
 from sb3_progpolicy.imitation.memory import SHARES, MemoryRun, imitate_with_memory
 from sb3_progpolicy.imitation.recurrent import RECURRENT_CELLS
 from sb3_progpolicy.imitation.rollouts import Collector, Pool, ProgramAct, Variations
-from sb3_progpolicy.imitation.saving import Scored, State, load_state, save_state
-from sb3_progpolicy.imitation.tasks import names_of, training_variations
+from sb3_progpolicy.imitation.saving import State, load_state, save_state
+from sb3_progpolicy.imitation.selection import Selection
+from sb3_progpolicy.imitation.tasks import names_of, training_variations, validation_variations
 from sb3_progpolicy.imitation.teachers import Teacher, TeacherLike, make_teacher
 from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.programs.syntax import Expression
@@ -27,14 +28,8 @@ from sb3_progpolicy.spaces import action_spec
 
 #: Share of the teacher in each round; 0 in all later ones.
 TEACHER_SHARES = (1.0, 0.6, 0.4, 0.3, 0.2, 0.1)
-N_ROUNDS, N_SPARSE_ROUNDS = 9, 3
-# Of the mean loss, and whether few inputs matter more; the sparsest program first.
-_TOLERANCES = ((0.012, True), (0.004, True), (0.003, False), (0.001, False))
-_FINALISTS = 3
+N_ROUNDS, N_PLAIN_ROUNDS, N_SPARSE_ROUNDS = 9, 3, 3
 _CHANGED = 0.02  # share of the actions, or mean distance, that rounding may change
-_RARE, _DROPS = 0.03, 5  # share of the states in which a rare branch acts; how many are tried without
-_NEAR, _LOSS = 1.3, 0.01  # a list whose loss is so many times the best one's, and more, is not looked at
-_SHORT = (7, 4, 2, 1)  # numbers of branches that are tried at the end
 _DIGITS = (2, 3, 4, 6)
 #: Inputs that are not read by default: beyond the training sizes they take values that were never seen.
 IGNORED = ("left",)
@@ -87,8 +82,9 @@ def imitate(
         program = imitate(PPO("MlpPolicy", "CartPole-v1").learn(60_000), "CartPole-v1", n_timesteps=20_000)
 
     States are visited by a mixture of teacher and student whose share of the teacher falls to 0, and labelled by the
-    teacher (DAgger, Ross et al. 2011). The program with the best episodes on training variations is made sparse and
-    round as far as its episodes stay as good. No other variation is looked at.
+    teacher (DAgger, Ross et al. 2011). The program with the best episodes on training variations is made plain, or
+    sparse, and round, as far as its episodes stay as good. A plain program, whose controllers are pieces of what the
+    teacher does, is taken if it is as good on the domain's validation variations, too; unseen ones are not looked at.
 
     :param teacher: ``"planner"``, a model of Stable-Baselines3 or sb3-contrib, or a function from observations
         ``(n_envs, n_observations)`` to actions
@@ -123,7 +119,7 @@ def imitate(
             f"max_conditions={max_conditions}; only without augment and checkpoint, and with at least 1 condition: a "
             "state that was not visited has no past, and the state of such an imitation is not kept"
         )
-    n_shares = N_ROUNDS + 1 + N_SPARSE_ROUNDS  # the first round has two
+    n_shares = N_ROUNDS + 1 + N_PLAIN_ROUNDS + N_SPARSE_ROUNDS  # the first round has two
     if n_timesteps < n_shares * n_envs or max_conditions < 0 or n_episodes < 1:
         raise ValueError(
             f"n_timesteps={n_timesteps}, max_conditions={max_conditions}, n_episodes={n_episodes} are not accepted; "
@@ -132,7 +128,7 @@ def imitate(
     begin = make_starts(augment)
     with Pool(env_id, n_envs, env_kwargs, interaction, begin) as pool:
         run = _Run(pool, teacher, env_id, tasks, seed, max_conditions + 1, ignore, n_episodes, score_tolerance, augment)
-        n_states = n_timesteps // (len(SHARES) + 1 if remembers else n_shares)
+        n_states = n_timesteps // (len(SHARES) + 1 if remembers else run.n_rounds + 1)
         with Pool(env_id, run.n_rows(n_states), env_kwargs, interaction, begin) as visited:
             if remembers:
                 return run.run_with_memory(visited, n_states, callback)
@@ -173,12 +169,16 @@ class _Run:
             self.origin["augment"] = augment if isinstance(augment, str) else getattr(augment, "__name__", "function")
         readable = np.array([name not in ignore for name in self.inputs])
         self.learner = Learner(self.codec, readable, Settings(max_branches, seed))
-        self.best: Scored | None = None
-        self.runners_up: list[Scored] = []
-        #: Value of the best list of all, before it was made smaller: what smaller ones are held to.
-        self.reference = -np.inf
+        beyond = validation_variations(env_id) if tasks is None else ()
+        self.selection = Selection(self.learner, self.judge, beyond, self.codec, augment is not None)
         self.n_labelled = 0
-        self.result: dict[str, float] = {}
+        #: Teachers with continuous actions may be made of pieces.
+        self.n_plain_rounds = N_PLAIN_ROUNDS if self.spec.kind == "box" else 0
+
+    @property
+    def n_rounds(self) -> int:
+        """Number of rounds at most."""
+        return N_ROUNDS + self.n_plain_rounds + N_SPARSE_ROUNDS
 
     def n_rows(self, n_states: int) -> int:
         """Return in how many environments so many states are visited, so that each sees whole episodes."""
@@ -213,13 +213,16 @@ class _Run:
         if checkpoint is not None and checkpoint.exists():
             first = self._restore(load_state(checkpoint, origin))
         self.judge.final = first >= N_ROUNDS
-        total = N_ROUNDS + N_SPARSE_ROUNDS
+        total = self.n_rounds
         for number in range(first, total):
             self._round(number, n_steps)
+            done = total if self.selection.is_plain else number + 1
             if checkpoint is not None:
-                save_state(checkpoint, origin, self._state(number + 1))
+                save_state(checkpoint, origin, self._state(done))
             if callback is not None:
-                callback(self._progress(number + 1, total))
+                callback(self._progress(done, total))
+            if done == total:
+                break
         return self._program(self._rounded())
 
     def run_with_memory(self, visited: Pool, n_states: int, callback: Callable[[Imitation], None] | None) -> Program:
@@ -231,12 +234,11 @@ class _Run:
         def after_round(done: int, total: int, n_labelled: int, best: Program) -> None:
             self.n_labelled = n_labelled
             if callback is not None:
-                callback(Imitation(done, total, n_labelled, self.result, self.judge.teacher_episodes.summary(), best))
+                summaries = self.judge.last_result, self.judge.teacher_episodes.summary()
+                callback(Imitation(done, total, n_labelled, *summaries, best))
 
         def score(program: Program) -> float:
-            reached = self.judge.score(ProgramAct(program, len(self.pool)))
-            self.result = self.judge.last_result
-            return reached
+            return self.judge.score(ProgramAct(program, len(self.pool)))
 
         run = MemoryRun(
             collector=Collector(visited, self.teacher, self.variations, self.ranks, self.seed, None, self.judge.limit),
@@ -253,7 +255,7 @@ class _Run:
         return imitate_with_memory(run, n_states // len(visited))
 
     def _state(self, number: int) -> State:
-        learner, collector = self.learner, self.collector
+        learner, collector, selection = self.learner, self.collector, self.selection
         return State(
             number=number,
             next_seed=collector.next_seed,
@@ -262,21 +264,25 @@ class _Run:
             targets=learner.targets,
             weights=learner.weights,
             present=learner.raw,
-            best=self.best,
-            runners_up=tuple(self.runners_up),
-            result=self.result,
-            reference=self.reference,
+            plain=learner.plain_raw,
+            plain_scored=tuple(selection.plain),
+            best=selection.best,
+            runners_up=tuple(selection.runners_up),
+            result=selection.result,
+            reference=selection.reference,
         )
 
     def _restore(self, state: State) -> int:
         """Go back to a state; return the number of rounds that are done."""
-        learner, collector = self.learner, self.collector
+        learner, collector, selection = self.learner, self.collector, self.selection
         learner.rng.bit_generator.state = state.generators["learner"]
         collector.rng.bit_generator.state = state.generators["collector"]
         collector.next_seed = state.next_seed
         learner.observations, learner.targets, learner.weights = state.observations, state.targets, state.weights
-        learner.raw, self.best, self.runners_up = state.present, state.best, list(state.runners_up)
-        self.result, self.reference = dict(state.result), state.reference
+        learner.raw, learner.plain_raw = state.present, state.plain
+        selection.best, selection.runners_up = state.best, list(state.runners_up)
+        selection.result, selection.reference = state.result, state.reference
+        selection.plain = list(state.plain_scored)
         return state.number
 
     def _round(self, number: int, n_steps: int) -> None:
@@ -287,102 +293,32 @@ class _Run:
         visits = self.collector.collect(n_steps * (1 if number else 2), student, share)
         targets = self.codec.encode(visits.actions) if visits.good is None else visits.good.astype(np.float64)
         learner.add(visits.inputs, targets, visits.weights)
+        selection, n_before_sparse = self.selection, N_ROUNDS + self.n_plain_rounds
         if number < N_ROUNDS - 1:
             for candidate in learner.fit(number):
                 if number >= N_ROUNDS // 2 - 1:
-                    self._offer(candidate)
+                    selection.offer(candidate)
             return
         if number == N_ROUNDS - 1:
             for candidate in learner.finish():
-                self._offer(candidate)
-            self._choose_finally()
-            self._make_short()
-            self._make_sparse()
-            return
-        self._offer(learner.refit_sparse(), sparse=True)
-        if number == N_ROUNDS + N_SPARSE_ROUNDS - 1:
-            self._drop_rare_branches()
-
-    def _choose_finally(self) -> None:
-        """Let the best few play more episodes, which none of them was chosen by."""
-        self.judge.final = True
-        self.best = None
-        for _, candidate in list(self.runners_up):
-            self._offer(candidate)
-        assert self.best is not None
-        self.learner.raw, self.reference = self.best[1], self._value(self.best)
-
-    def _make_short(self) -> None:
-        """Go on with lists of fewer and fewer branches as long as their episodes are as good as the best ones."""
-        assert self.best is not None
-        most = self.best[1].n_branches
-        for n_branches in (number for number in _SHORT if number < most):
-            if self._take_over(self.learner.short(n_branches)) is not None:
-                return
-
-    def _make_sparse(self) -> None:
-        """Go on with the program of fewest inputs whose episodes are as good as the best ones.
-
-        If there is none, the rounds that follow are those of the best one of few inputs, whose mistakes they visit.
-        """
-        assert self.best is not None
-        dense, few = self.best[1], []
-        for tolerance, always_few in _TOLERANCES:
-            sparse = self.learner.sparse(dense, tolerance, always_few)
-            reached = self._take_over(sparse)
-            if reached is None:
-                return
-            if always_few:
-                few.append((reached, sparse))
-        self.learner.raw = max(few, key=lambda scored: scored[0])[1]
-
-    def _drop_rare_branches(self) -> None:
-        """Leave out branches that hardly ever act, one after another, as long as the episodes stay as good."""
-        assert self.best is not None
-        tries = 0
-        while self.best[1].n_branches > 1:
-            for index in self.learner.rare_branches(self.best[1], _RARE):
-                if tries == _DROPS:
-                    return
-                tries += 1
-                if self._take_over(self.learner.without(self.best[1], index)) is None:
-                    break
-            else:
-                return
-
-    def _take_over(self, candidate: DecisionList) -> float | None:
-        """Go on with a smaller list if its loss is not far from the best one's and its episodes are as good.
-
-        :return: ``None``, or, if it is not so, its value
-        """
-        assert self.best is not None
-        if self.learner.loss_of(candidate) > _NEAR * self.learner.loss_of(self.best[1]) + _LOSS:
-            return -np.inf
-        reached = self._score(candidate, self.best[0])
-        value = self._value((reached, candidate))
-        if not self.judge.as_good(value, self.reference):
-            return value
-        self.best, self.learner.raw, self.result = (reached, candidate), candidate, self.judge.last_result
-        return None
-
-    def _value(self, scored: Scored) -> float:
-        """Return the score less the loss where states were labelled that no episode comes to, else the score."""
-        score, candidate = scored
-        return score if self.augmentation is None else score - self.learner.loss_of(candidate)
-
-    def _offer(self, candidate: DecisionList, sparse: bool = False) -> None:
-        """Keep a candidate if its episodes are better than the best so far."""
-        offered = self._score(candidate), candidate
-        ranked = sorted([*self.runners_up, offered], key=self._value, reverse=True)
-        self.runners_up = ranked[:_FINALISTS]
-        value, least = self._value(offered), -np.inf if self.best is None else self._value(self.best)
-        if value >= least or (sparse and self.judge.as_good(value, self.reference)):
-            self.best, self.result = offered, self.judge.last_result
+                selection.offer(candidate)
+            selection.choose_finally()
+            selection.make_short()
+        if number < n_before_sparse:
+            selection.make_plain(fresh=(number - N_ROUNDS) % 2 == 1)
+            if number == n_before_sparse - 1:
+                selection.choose_plain()
+                if not selection.is_plain:
+                    selection.make_sparse()
+        else:
+            selection.offer(learner.refit_sparse(), sparse=True)
+        if selection.is_plain or number == self.n_rounds - 1:
+            selection.drop_rare_branches()
 
     def _rounded(self) -> DecisionList:
         """Return the best list with as few digits as its episodes allow, its outputs in the unit of actions."""
-        assert self.best is not None
-        score, best = self.best
+        assert self.selection.best is not None
+        score, best = self.selection.best
         raw = DecisionList(best.conditions, self.codec.to_action_units(best.controllers))
         states = self.learner.observations[:: max(1, self.learner.n_states // 2000)]
         exact = self.codec.act_of(best)(states)
@@ -396,18 +332,16 @@ class _Run:
                 return candidate
         return raw
 
-    def _score(self, raw: DecisionList, needed: float | None = None) -> float:
-        return self.judge.score(self.codec.act_of(raw), needed)
-
     def _progress(self, number: int, total: int) -> Imitation:
         assert self.learner.raw is not None
-        raw = self.learner.raw if self.best is None else self.best[1]
+        best = self.selection.best
+        raw = self.learner.raw if best is None else best[1]
         in_units = DecisionList(raw.conditions, self.codec.to_action_units(raw.controllers))
         return Imitation(
             number,
             total,
             self.learner.n_states,
-            self.result,
+            self.selection.result,
             self.judge.teacher_episodes.summary(),
             self._program(in_units),
         )

@@ -97,6 +97,44 @@ def fit_sparse_condition(
     return best if always_few else full
 
 
+def fit_priced_condition(
+    inputs: Floats, gains: Floats, start: Floats, price: float, most: int = 4
+) -> tuple[Floats | None, float]:
+    """Return the condition of a few inputs whose sum of gains, less the price of its inputs, is the largest.
+
+    :param inputs: ``(n, width)``
+    :param gains: ``(n,)``
+    :param start: a condition that is known
+    :param price: of an input, in the unit of the gains
+    :param most: number of inputs at most
+    :return: the condition ``(width,)``, ``None`` if there is hardly anything to gain; and its gains less the price
+    """
+    full, _ = fit_condition(inputs, gains, start, ridges=(1e-3,))
+    if full is None:
+        return None, 0.0
+    rows, costs = _sample(gains)
+    some, costs = inputs[rows], costs / costs.mean()
+    directions = (logistic(some, gains[rows] > 0, costs, None, 1e-4), _SHARPNESS * full)
+    paths = [_elimination(some, costs, direction) for direction in directions]
+    supports = [
+        next(step for step in path if step[0].sum() <= size + 1) for size in range(1, most + 1) for path in paths
+    ]
+    known = start != 0
+    known[-1] = True
+    if known.sum() <= most + 1:
+        supports.append((known, start))
+    best, largest = None, -np.inf
+    for kept, adjusted in supports:
+        fewer, _ = fit_condition(inputs[:, kept], gains, adjusted[kept], ridges=(1e-4,), cautions=(1.0, 2.0))
+        if fewer is None:
+            continue
+        fewer, gained = improve(inputs[:, kept], gains, fewer)
+        if gained - price * (kept.sum() - 1) > largest:
+            best, largest = np.zeros(len(kept)), gained - price * float(kept.sum() - 1)
+            best[kept] = fewer
+    return best, largest
+
+
 def _sample(gains: Floats) -> tuple[np.ndarray, Floats]:
     """Return which states a regression looks at, and what each of them counts.
 

@@ -141,3 +141,15 @@ class DecisionList:
         :param new: of the list returned
         """
         return DecisionList(new.from_raw(old.to_raw(self.conditions)), new.from_raw(old.to_raw(self.controllers)))
+
+
+def rest_losses(losses: Floats, holds: NDArray[np.bool_]) -> list[Floats]:
+    """Return, for every branch, the loss of the list from there on, ``(n,)`` each.
+
+    :param losses: of each branch's controller in each state, ``(n, n_branches)``
+    :param holds: whether each condition holds, ``(n, n_branches - 1)``
+    """
+    rest = [losses[:, -1]]
+    for index in reversed(range(holds.shape[1])):
+        rest.insert(0, np.where(holds[:, index], losses[:, index], rest[0]))
+    return rest

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sb3_progpolicy.imitation.conditions import fit_condition, fit_sparse_condition
-from sb3_progpolicy.imitation.decision_list import Data, DecisionList, Floats
+from sb3_progpolicy.imitation.decision_list import Data, DecisionList, Floats, rest_losses
 from sb3_progpolicy.imitation.losses import Loss, mean_loss
 
 _NEIGHBOURS = 120
@@ -53,7 +52,7 @@ def _with_one_more(
     """Return the list with the branch of the largest gain, at whatever position."""
     losses = loss.matrix(data, program.controllers)
     holds = data.inputs @ program.conditions.T >= 0
-    rest = _rest_losses(losses, holds)
+    rest = rest_losses(losses, holds)
     present = rest[0]
 
     def gain(controller: Floats) -> tuple[float, Floats]:
@@ -263,11 +262,3 @@ def sparsify(
             holds[:, index] = data.inputs @ conditions[index] >= 0
             rest = np.where(holds[:, index], losses[:, index], rest)
     return drop_branches(loss, DecisionList(conditions, controllers), data, price=0.1 * tolerance)
-
-
-def _rest_losses(losses: Floats, holds: NDArray[np.bool_]) -> list[Floats]:
-    """Return, for every branch, the loss of the list from there on, ``(n,)`` each."""
-    rest = [losses[:, -1]]
-    for index in reversed(range(holds.shape[1])):
-        rest.insert(0, np.where(holds[:, index], losses[:, index], rest[0]))
-    return rest

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,13 +10,17 @@ from numpy.typing import NDArray
 from sb3_progpolicy.imitation.actions import ActionCodec
 from sb3_progpolicy.imitation.decision_list import Data, DecisionList, Floats, Scaler
 from sb3_progpolicy.imitation.fitting import alternate, fit_planes, grow, sparsify
-from sb3_progpolicy.imitation.losses import mean_loss
+from sb3_progpolicy.imitation.losses import BoxLoss, mean_loss
+from sb3_progpolicy.imitation.ordering import Order, Ordering
+from sb3_progpolicy.imitation.pieces import PieceFinder, PieceLoss
 from sb3_progpolicy.imitation.tuning import fine_tune
 
 _FEW, _MANY = 6_000, 15_000  # states for a fit from nothing, and for one that only improves
 _REFIT_EVERY = 3  # rounds
 _COMPETES = 1.3  # a list whose loss is so many times the least has its episodes looked at, too
 _RESTARTS = 3  # of the fit by planes
+_EXPLAINED = 0.7  # share of the states that pieces have to explain, or the teacher is not made of them
+_STALLED = 60.0  # weight of a state in which a student stands still, for plain lists: one of them loses the episode
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,8 @@ class Learner:
         self.weights = np.zeros(0)
         #: The present list, on raw observations.
         self.raw: DecisionList | None = None
+        #: The last plain list, on raw observations.
+        self.plain_raw: DecisionList | None = None
 
     @property
     def n_states(self) -> int:
@@ -133,6 +139,39 @@ class Learner:
         """
         scaler, data = self._prepared()
         return self._refitted(self._scaled(raw.without(index), scaler), data, scaler, self.settings.round_steps)
+
+    def plain(self, fresh: bool) -> list[DecisionList]:
+        """Return plain lists: pieces of what the teacher does, put in an order by conditions of few inputs.
+
+        :param fresh: whether to order the pieces from nothing, too
+        :return: the list and the same with all its numbers fitted at once, on raw observations; none if the teacher is
+            not made of such pieces
+        """
+        if not isinstance(self.loss, BoxLoss):
+            return []
+        scaler, data = self._prepared()
+        data = replace(data, weights=np.where(self.weights > 1, _STALLED, self.weights))
+        loss = PieceLoss(self.loss.bounded, self.loss.direction)
+        finder = PieceFinder(loss, data, self.rng)
+        known = None if self.plain_raw is None else self._scaled(self.plain_raw, scaler)
+        own = [] if known is None else list(np.unique(known.controllers, axis=0))
+        pieces = finder.find(own)
+        if finder.explained(pieces) < _EXPLAINED:
+            return []
+        ordering = Ordering(data, loss.matrix(data, pieces), self.settings.max_branches)
+        orders = []
+        if known is not None:
+            losses = np.abs(known.controllers[:, None] - pieces[None]).sum(axis=(2, 3))
+            orders.append(ordering.fit(Order(tuple(known.conditions), tuple(map(int, losses.argmin(axis=1))))))
+        if known is None or fresh:
+            orders.append(ordering.fit())
+        order = min(orders, key=ordering.cost)
+        width = data.inputs.shape[1]
+        plain = DecisionList(np.array(order.conditions).reshape(-1, width), pieces[list(order.pieces)])
+        self.plain_raw = _raw(plain, scaler)
+        seed = int(self.rng.integers(2**31))
+        tuned = fine_tune(self.loss, plain, data, self.settings.final_steps // 2, seed, (0.1, 0.02), keep_zeros=True)
+        return [self.plain_raw, _raw(tuned, scaler)]
 
     def refit_sparse(self) -> DecisionList:
         """Fit the numbers of the present list that are not 0 to all states, and return it."""

@@ -55,7 +55,8 @@ def mean_loss(loss: Loss, program: DecisionList, data: Data) -> float:
     return float(np.average(list_losses(loss, program, data), weights=data.weights))
 
 
-def _huber(sizes: Floats) -> Floats:
+def huber(sizes: Floats) -> Floats:
+    """Return Huber's loss of the sizes of errors."""
     return np.where(sizes < _DELTA, 0.5 * sizes * sizes / _DELTA, sizes - 0.5 * _DELTA)
 
 
@@ -77,7 +78,7 @@ class BoxLoss:
         outputs = (data.inputs @ controllers.reshape(-1, width).T).reshape(-1, n_controllers, n_outputs)
         outputs = np.where(self.bounded, np.clip(outputs, -1, 1), outputs)
         errors = outputs - data.targets[:, None]
-        losses = _huber(np.abs(errors))
+        losses = huber(np.abs(errors))
         if self.direction:
             over = errors * np.sign(data.targets)[:, None] > 0
             losses = np.where(over, losses * self._slack(data.targets)[:, None], losses)
@@ -94,7 +95,7 @@ class BoxLoss:
             for output in range(n_outputs):
                 weights = data.weights
                 if iteration or start is not None:
-                    weights = weights * self._reweighted(data, controller[output], output, slack)
+                    weights = weights * self.reweighted(data, controller[output], output, slack)
                 scaled = data.inputs * weights[:, None]
                 controller[output] = np.linalg.solve(
                     scaled.T @ data.inputs + penalty, scaled.T @ data.targets[:, output]
@@ -107,15 +108,15 @@ class BoxLoss:
         slack, width = self._slack(data.targets), data.inputs.shape[1]
         sparse = full.copy()
         for output in range(len(full)):
-            weights = data.weights * np.maximum(self._reweighted(data, full[output], output, slack), 0.02)
+            weights = data.weights * np.maximum(self.reweighted(data, full[output], output, slack), 0.02)
             hessian = (data.inputs * weights[:, None]).T @ data.inputs / _DELTA + 1e-5 * len(data) * np.eye(width)
             supports = eliminate(hessian, full[output])
-            limit = self._one(data, full[output], output, slack) + tolerance
+            limit = self.of_output(data, full[output], output, slack) + tolerance
             least = np.inf
             for size in _SUPPORTS[: _SUPPORTS.index(_FEW) + 1] if always_few else _SUPPORTS:
                 support = next(kept for kept, _ in supports if kept.sum() <= size + 1)
-                row = self._fit_support(data, output, support, slack)
-                reached = self._one(data, row, output, slack)
+                row = self.fit_support(data, output, support, slack)
+                reached = self.of_output(data, row, output, slack)
                 if reached <= limit or (always_few and reached < least):
                     sparse[output], least = row, reached
                 if reached <= limit:
@@ -148,7 +149,7 @@ class BoxLoss:
             slack[:, columns] = np.where(shortened, _OVERSHOOT, 1.0)
         return slack
 
-    def _reweighted(self, data: Data, row: Floats, output: int, slack: Floats) -> Floats:
+    def reweighted(self, data: Data, row: Floats, output: int, slack: Floats) -> Floats:
         """Return the weights whose squared loss has the gradient of this one; 0 beyond a bound that the label is at."""
         target = data.targets[:, output]
         errors = data.inputs @ row - target
@@ -159,21 +160,22 @@ class BoxLoss:
             weights = np.where(over & (np.abs(target) >= _SATURATED), 0.0, weights)
         return weights
 
-    def _one(self, data: Data, row: Floats, output: int, slack: Floats) -> float:
+    def of_output(self, data: Data, row: Floats, output: int, slack: Floats) -> float:
         """Return the mean loss of one output."""
         target = data.targets[:, output]
         values = data.inputs @ row
         errors = (np.clip(values, -1, 1) if self.bounded[output] else values) - target
-        losses = _huber(np.abs(errors))
+        losses = huber(np.abs(errors))
         losses = np.where(errors * np.sign(target) > 0, losses * slack[:, output], losses)
         return float(np.average(losses, weights=data.weights))
 
-    def _fit_support(self, data: Data, output: int, support: np.ndarray, slack: Floats) -> Floats:
+    def fit_support(self, data: Data, output: int, support: np.ndarray, slack: Floats) -> Floats:
+        """Return the weights of one output ``(width,)`` that are 0 outside a support, a mask with the constant."""
         row = np.zeros(data.inputs.shape[1])
         inputs, target = data.inputs[:, support], data.targets[:, output]
         penalty = 1e-5 * len(data) * np.eye(inputs.shape[1])
         for iteration in range(6):
-            weights = data.weights * (self._reweighted(data, row, output, slack) if iteration else 1.0)
+            weights = data.weights * (self.reweighted(data, row, output, slack) if iteration else 1.0)
             scaled = inputs * weights[:, None]
             row[support] = np.linalg.solve(scaled.T @ inputs + penalty, scaled.T @ target)
         return row

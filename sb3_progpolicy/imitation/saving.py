@@ -28,6 +28,8 @@ class State:
     :param targets: their labels, ``(n, n_outputs)``
     :param weights: ``(n,)``
     :param present: the present list
+    :param plain: the last plain list
+    :param plain_scored: the best plain lists with their scores
     :param best: score and list; ``None`` before the first validation
     :param runners_up: the best few with their scores
     :param result: of the best list in its validation
@@ -41,6 +43,8 @@ class State:
     targets: Floats
     weights: Floats
     present: DecisionList | None
+    plain: DecisionList | None
+    plain_scored: tuple[Scored, ...]
     best: Scored | None
     runners_up: tuple[Scored, ...]
     result: Mapping[str, float]
@@ -56,8 +60,8 @@ def save_state(path: Path, origin: Mapping[str, Any], state: State) -> None:
     """
     scored = [*([state.best] if state.best is not None else []), *state.runners_up]
     lists = {f"scored{index}": program for index, (_, program) in enumerate(scored)}
-    if state.present is not None:
-        lists["present"] = state.present
+    lists.update({f"plain{index}": program for index, (_, program) in enumerate(state.plain_scored)})
+    lists.update({name: own for name in ("present", "plain") if (own := getattr(state, name)) is not None})
     arrays: dict[str, Any] = {
         f"{name}_{part}": getattr(program, part)
         for name, program in lists.items()
@@ -70,6 +74,7 @@ def save_state(path: Path, origin: Mapping[str, Any], state: State) -> None:
         "generators": state.generators,
         "has_best": state.best is not None,
         "scores": [score for score, _ in scored],
+        "plain_scores": [score for score, _ in state.plain_scored],
         "result": dict(state.result),
         "reference": state.reference,
     }
@@ -106,6 +111,8 @@ def load_state(path: Path, origin: Mapping[str, Any]) -> State:
             targets=parts["targets"],
             weights=parts["weights"],
             present=_list(parts, "present") if "present_controllers" in parts else None,
+            plain=_list(parts, "plain") if "plain_controllers" in parts else None,
+            plain_scored=tuple((score, _list(parts, f"plain{i}")) for i, score in enumerate(about["plain_scores"])),
             best=scored[0] if about["has_best"] else None,
             runners_up=tuple(scored[int(about["has_best"]) :]),
             result=about["result"],

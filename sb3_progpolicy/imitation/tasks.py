@@ -26,6 +26,12 @@ def training_variations(env_id: str, tasks: Variations | None) -> tuple[Variatio
     return variations, [sizes.index(variation[domain.size]) for variation in variations]
 
 
+def validation_variations(env_id: str) -> Variations:
+    """Return the variations that a domain has for choosing: one size beyond those it is trained on; none elsewhere."""
+    domain = find_domain(env_id)
+    return () if domain is None else domain.validation
+
+
 def names_of(env: Any, n_outputs: int, interaction: bool) -> Names:
     """Return readable names of a program's inputs and outputs, see :func:`~sb3_progpolicy.names.readable_names`.
 

@@ -1,0 +1,149 @@
+"""A decision list of given pieces, with conditions of few inputs: inserted one by one, each where it pays most."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_progpolicy.imitation.conditions import fit_condition, fit_priced_condition
+from sb3_progpolicy.imitation.decision_list import Data, DecisionList, Floats, rest_losses
+
+PRICE = 0.001  # of an input of a condition, in mean loss
+_WORTH = 0.001  # mean loss that a branch has to take away beyond the price of its condition
+_MATTERS = 1e-3  # a gain, as a share of the largest weight, below which a state does not matter
+_CLOSER = 6  # insertions that are looked at with few inputs, the best of those with all inputs
+
+
+@dataclass(frozen=True)
+class Order:
+    """Conditions, and which piece acts where each is the first to hold.
+
+    :param conditions: ``(width,)`` each
+    :param pieces: indices, one more than conditions; the last piece acts where none holds
+    """
+
+    conditions: tuple[Floats, ...]
+    pieces: tuple[int, ...]
+
+    def insert(self, position: int, condition: Floats, piece: int) -> Order:
+        """Return the order with one more branch."""
+        conditions, pieces = list(self.conditions), list(self.pieces)
+        conditions.insert(position, condition)
+        pieces.insert(position, piece)
+        return Order(tuple(conditions), tuple(pieces))
+
+    def without(self, branch: int) -> Order:
+        """Return the order without a branch; without the last one, the last condition's piece is the else."""
+        conditions, pieces = list(self.conditions), list(self.pieces)
+        del conditions[min(branch, len(conditions) - 1)], pieces[branch]
+        return Order(tuple(conditions), tuple(pieces))
+
+
+class Ordering:
+    """Puts pieces in an order.
+
+    :param data: labelled states
+    :param losses: of every piece in every state, ``(n, n_pieces)``; more than 1 counts as 1
+    :param most: number of branches at most
+    """
+
+    def __init__(self, data: Data, losses: Floats, most: int) -> None:
+        self.inputs, self.losses, self.most = data.inputs, np.minimum(losses, 1.0), most
+        self.shares = data.weights / data.weights.sum()
+
+    def fit(self, start: Order | None = None) -> Order:
+        """Return an order of small loss and few inputs.
+
+        :param start: to go on with; by default the one piece of the least loss
+        """
+        alone = Order((), (int((self.shares @ self.losses).argmin()),))
+        order = alone if start is None else self._swept(start)
+        while len(order.pieces) < self.most:
+            longer = self._with_one_more(order)
+            if longer is None:
+                break
+            order = self._swept(self._swept(longer))
+        return self._shortened(order)
+
+    def cost(self, order: Order) -> float:
+        """Return the mean loss and the price of the inputs."""
+        return float(self.shares @ self._rest(order)[0]) + sum(map(_price, order.conditions))
+
+    def _holds(self, order: Order) -> NDArray[np.bool_]:
+        if not order.conditions:
+            return np.zeros((len(self.inputs), 0), dtype=bool)
+        return np.asarray(self.inputs @ np.array(order.conditions).T >= 0)
+
+    def _rest(self, order: Order) -> list[Floats]:
+        return rest_losses(self.losses[:, list(order.pieces)], self._holds(order))
+
+    def _with_one_more(self, order: Order) -> Order | None:
+        """Return the order with the branch of the largest gain, whatever piece and position, if there is one."""
+        rest, holds = self._rest(order), self._holds(order)
+        candidates = []
+        for position in range(len(order.pieces)):
+            reached = _none(holds[:, :position])
+            for piece in range(self.losses.shape[1]):
+                gains = self.shares * (rest[position] - self.losses[:, piece])
+                here = self._matters(gains, reached)
+                if np.maximum(gains[here], 0).sum() < 2 * _WORTH:
+                    continue
+                condition, gain = fit_condition(self.inputs[here], gains[here], ridges=(1e-3,), cautions=(1.0,))
+                if condition is not None:
+                    candidates.append((gain, position, piece, condition))
+        candidates.sort(key=lambda candidate: -candidate[0])
+        best, most = None, _WORTH
+        for _, position, piece, condition in candidates[:_CLOSER]:
+            gains = self.shares * (rest[position] - self.losses[:, piece])
+            here = self._matters(gains, _none(holds[:, :position]))
+            fewer, gain = fit_priced_condition(self.inputs[here], gains[here], condition, PRICE)
+            if fewer is not None and gain > most:
+                best, most = order.insert(position, fewer, piece), gain
+        return best
+
+    def _swept(self, order: Order) -> Order:
+        """Return the order with each condition fitted again, given all others, then the best piece for each branch."""
+        conditions = list(order.conditions)
+        for index in reversed(range(len(conditions))):
+            present = Order(tuple(conditions), order.pieces)
+            gains = self.shares * (self._rest(present)[index + 1] - self.losses[:, order.pieces[index]])
+            here = self._matters(gains, _none(self._holds(present)[:, :index]))
+            if here.sum() < 20:
+                continue
+            old = gains[here & (self.inputs @ conditions[index] >= 0)].sum() - _price(conditions[index])
+            condition, gain = fit_priced_condition(self.inputs[here], gains[here], conditions[index], PRICE)
+            if condition is not None and gain > old:
+                conditions[index] = condition
+        order = Order(tuple(conditions), order.pieces)
+        acting = DecisionList(
+            np.array(conditions).reshape(-1, self.inputs.shape[1]), np.zeros((len(order.pieces), 0, 0))
+        ).branches(self.inputs)
+        pieces = [
+            int((self.shares[here] @ self.losses[here]).argmin()) if (here := acting == branch).any() else piece
+            for branch, piece in enumerate(order.pieces)
+        ]
+        return Order(order.conditions, tuple(pieces))
+
+    def _shortened(self, order: Order) -> Order:
+        """Leave out branches that are not worth more than what each has to be."""
+        cost = self.cost(order)
+        while order.conditions:
+            shorter = min((order.without(branch) for branch in range(len(order.pieces))), key=self.cost)
+            if self.cost(shorter) > cost + _WORTH:
+                break
+            order, cost = shorter, min(cost, self.cost(shorter))
+        return order
+
+    def _matters(self, gains: Floats, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        return np.asarray(reached & (np.abs(gains) > _MATTERS * self.shares.max()))
+
+
+def _price(condition: Floats) -> float:
+    return PRICE * float(np.count_nonzero(condition[:-1]))
+
+
+def _none(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return in which states none of some conditions holds."""
+    return np.asarray(~holds.any(axis=1))

@@ -1,0 +1,161 @@
+"""Which list to go on with: the one of the best episodes, then the smallest whose episodes are as good."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sb3_progpolicy.imitation.actions import ActionCodec
+from sb3_progpolicy.imitation.decision_list import DecisionList
+from sb3_progpolicy.imitation.judge import Judge
+from sb3_progpolicy.imitation.learner import Learner
+from sb3_progpolicy.imitation.rollouts import Variations
+from sb3_progpolicy.imitation.saving import Scored
+
+# Of the mean loss, and whether few inputs matter more; the sparsest program first.
+_TOLERANCES = ((0.012, True), (0.004, True), (0.003, False), (0.001, False))
+_FINALISTS = 3
+_RARE, _DROPS = 0.03, 5  # share of the states in which a rare branch acts; how many are tried without
+_NEAR, _LOSS = 1.3, 0.01  # a list whose loss is so many times the best one's, and more, is not looked at
+_SHORT = (7, 4, 2, 1)  # numbers of branches that are tried at the end
+
+
+class Selection:
+    """The best list so far, and the search for a smaller one that is as good.
+
+    :param learner: fits lists to the labelled states
+    :param judge: plays episodes on training variations
+    :param beyond: the domain's validation variations, by which a plain list is taken or not; none if empty
+    :param codec: of the actions
+    :param augmented: whether states were labelled that no episode comes to
+    """
+
+    def __init__(self, learner: Learner, judge: Judge, beyond: Variations, codec: ActionCodec, augmented: bool) -> None:
+        self.learner, self.judge, self.beyond, self.codec = learner, judge, beyond, codec
+        self.augmented = augmented
+        self.best: Scored | None = None
+        self.runners_up: list[Scored] = []
+        #: Value of the best list of all, before it was made smaller: what smaller ones are held to.
+        self.reference = -np.inf
+        self.result: Mapping[str, float] = {}
+        #: The best plain lists with their scores.
+        self.plain: list[Scored] = []
+        #: Whether a plain list was taken over.
+        self.is_plain = False
+
+    def offer(self, candidate: DecisionList, sparse: bool = False) -> None:
+        """Keep a candidate if its episodes are better than the best so far.
+
+        :param candidate: on raw observations
+        :param sparse: whether it need only be as good as the best list was before it was made smaller
+        """
+        offered = self.score(candidate), candidate
+        ranked = sorted([*self.runners_up, offered], key=self._value, reverse=True)
+        self.runners_up = ranked[:_FINALISTS]
+        value, least = self._value(offered), -np.inf if self.best is None else self._value(self.best)
+        if value >= least or (sparse and self.judge.as_good(value, self.reference)):
+            self.best, self.result = offered, self.judge.last_result
+
+    def choose_finally(self) -> None:
+        """Let the best few play more episodes, which none of them was chosen by."""
+        self.judge.final = True
+        self.best = None
+        for _, candidate in list(self.runners_up):
+            self.offer(candidate)
+        assert self.best is not None
+        self.learner.raw, self.reference = self.best[1], self._value(self.best)
+
+    def make_short(self) -> None:
+        """Go on with lists of fewer and fewer branches as long as their episodes are as good as the best ones."""
+        assert self.best is not None
+        most = self.best[1].n_branches
+        for n_branches in (number for number in _SHORT if number < most):
+            if self._take_over(self.learner.short(n_branches)) is not None:
+                return
+
+    def make_plain(self, fresh: bool) -> None:
+        """Keep the plain lists of the best episodes; the states of the next round are those that the best one visits.
+
+        :param fresh: whether to look for one from nothing, too
+        """
+        plain = [(self.score(candidate), candidate) for candidate in self.learner.plain(fresh)]
+        if plain:
+            self.learner.raw = max(plain, key=lambda one: one[0])[1]
+            # Of equal ones the later: it has seen more.
+            self.plain = sorted([*plain, *self.plain], key=lambda one: one[0], reverse=True)[:_FINALISTS]
+
+    def choose_plain(self) -> None:
+        """Go on with the best plain list if its episodes are as good as the best list's, also beyond training."""
+        assert self.best is not None
+        self.learner.raw = self.best[1]
+        if not self.plain:
+            return
+        dense, *merits = (self._merit(candidate) for _, candidate in (self.best, *self.plain))
+        index = max(range(len(merits)), key=lambda one: merits[one])
+        loss = self.learner.loss_of if self.augmented else lambda _: 0.0
+        needed = dense[0] - loss(self.best[1]) + loss(self.plain[index][1])
+        if self.judge.as_good(merits[index][0], needed) and self.judge.as_good(merits[index][1], dense[1]):
+            self.best, self.is_plain = self.plain[index], True
+            self.learner.raw, self.reference = self.best[1], self.best[0]
+            self.score(self.best[1])
+            self.result = self.judge.last_result
+
+    def make_sparse(self) -> None:
+        """Go on with the program of fewest inputs whose episodes are as good as the best ones.
+
+        If there is none, the rounds that follow are those of the best one of few inputs, whose mistakes they visit.
+        """
+        assert self.best is not None
+        dense, few = self.best[1], []
+        for tolerance, always_few in _TOLERANCES:
+            sparse = self.learner.sparse(dense, tolerance, always_few)
+            reached = self._take_over(sparse)
+            if reached is None:
+                return
+            if always_few:
+                few.append((reached, sparse))
+        self.learner.raw = max(few, key=lambda scored: scored[0])[1]
+
+    def drop_rare_branches(self) -> None:
+        """Leave out branches that hardly ever act, one after another, as long as the episodes stay as good."""
+        assert self.best is not None
+        tries = 0
+        while self.best[1].n_branches > 1:
+            for index in self.learner.rare_branches(self.best[1], _RARE):
+                if tries == _DROPS:
+                    return
+                tries += 1
+                if self._take_over(self.learner.without(self.best[1], index)) is None:
+                    break
+            else:
+                return
+
+    def score(self, raw: DecisionList, needed: float | None = None) -> float:
+        """Return the score of a list's episodes; see :meth:`~sb3_progpolicy.imitation.judge.Judge.score`."""
+        return self.judge.score(self.codec.act_of(raw), needed)
+
+    def _merit(self, candidate: DecisionList) -> tuple[float, float]:
+        """Return the scores of many episodes on training variations and on validation variations, 0 without these."""
+        act = self.codec.act_of(candidate)
+        return self.judge.score_at_length(act), self.judge.score_at_length(act, self.beyond) if self.beyond else 0.0
+
+    def _take_over(self, candidate: DecisionList) -> float | None:
+        """Go on with a smaller list if its loss is not far from the best one's and its episodes are as good.
+
+        :return: ``None``, or, if it is not so, its value
+        """
+        assert self.best is not None
+        if self.learner.loss_of(candidate) > _NEAR * self.learner.loss_of(self.best[1]) + _LOSS:
+            return -np.inf
+        reached = self.score(candidate, self.best[0])
+        value = self._value((reached, candidate))
+        if not self.judge.as_good(value, self.reference):
+            return value
+        self.best, self.learner.raw, self.result = (reached, candidate), candidate, self.judge.last_result
+        return None
+
+    def _value(self, scored: Scored) -> float:
+        """Return the score less the loss where states were labelled that no episode comes to, else the score."""
+        score, candidate = scored
+        return score - self.learner.loss_of(candidate) if self.augmented else score

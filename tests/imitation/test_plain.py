@@ -1,0 +1,194 @@
+"""Plain lists: the pieces of a list that is known, found again and put in order."""
+
+import numpy as np
+import pytest
+
+from sb3_progpolicy.imitation import imitate
+from sb3_progpolicy.imitation.actions import ActionCodec
+from sb3_progpolicy.imitation.conditions import fit_priced_condition
+from sb3_progpolicy.imitation.decision_list import Data, DecisionList, rest_losses
+from sb3_progpolicy.imitation.judge import Judge
+from sb3_progpolicy.imitation.learner import Learner, Settings
+from sb3_progpolicy.imitation.losses import BoxLoss
+from sb3_progpolicy.imitation.ordering import Order, Ordering
+from sb3_progpolicy.imitation.pieces import PieceFinder, PieceLoss
+from sb3_progpolicy.imitation.rollouts import Pool
+from sb3_progpolicy.imitation.selection import Selection
+from sb3_progpolicy.imitation.tasks import validation_variations
+from sb3_progpolicy.imitation.teachers import make_teacher
+from sb3_progpolicy.spaces import ActionSpec
+
+ALL, N_INPUTS = np.array([True, True, True]), 8
+PIECES = np.zeros((3, 3, N_INPUTS + 1))
+PIECES[0, 0, 0], PIECES[0, 1, 1], PIECES[0, 2, -1] = 0.7, 0.7, 0.3  # to a place, the third number constant
+PIECES[1, 0, -1], PIECES[1, 1, -1], PIECES[1, 2, 2] = 0.0, 0.5, -1.5
+PIECES[2, 0, 3], PIECES[2, 1, 4], PIECES[2, 2, -1] = -1.0, 0.8, -0.2
+CONDITIONS = np.zeros((2, N_INPUTS + 1))
+CONDITIONS[0, 5], CONDITIONS[0, -1] = 1.0, -0.4
+CONDITIONS[1, 6], CONDITIONS[1, 7] = 1.0, -1.0
+KNOWN = DecisionList(CONDITIONS, PIECES)
+
+
+def shortened(outputs, columns=(0, 1)):
+    """Shorten a vector so that it keeps its direction, and clip the rest."""
+    fitted, vector = outputs.copy(), outputs[:, list(columns)]
+    fitted[:, list(columns)] = vector / np.maximum(np.abs(vector).max(axis=1, keepdims=True), 1.0)
+    return np.clip(fitted, -1, 1)
+
+
+def labelled(n=4000, seed=0):
+    rng = np.random.default_rng(seed)
+    inputs = np.column_stack([rng.normal(size=(n, N_INPUTS)), np.ones(n)])
+    return Data(inputs, shortened(KNOWN.outputs(inputs)), np.ones(n))
+
+
+def test_loss_of_pieces_is_that_of_what_the_teacher_shortens():
+    data, loss = labelled(), PieceLoss(ALL, (0, 1))
+    acting = KNOWN.branches(data.inputs)
+    matrix = loss.matrix(data, PIECES)
+    np.testing.assert_allclose(matrix[np.arange(len(data)), acting], 0, atol=1e-12)
+    clipped = BoxLoss(ALL).matrix(data, PIECES)[np.arange(len(data)), acting]
+    assert clipped.max() > 0.1  # clipping each number alone turns the vector
+    alone = Data(data.inputs, np.clip(KNOWN.outputs(data.inputs), -1, 1), data.weights)
+    np.testing.assert_allclose(PieceLoss(ALL).matrix(alone, PIECES)[np.arange(len(data)), acting], 0, atol=1e-12)
+
+
+def test_labels_are_lengthened_to_what_a_piece_gives():
+    data = labelled().take(KNOWN.branches(labelled().inputs) == 0)
+    longer = PieceLoss(ALL, (0, 1)).lengthened(data, PIECES[0])
+    np.testing.assert_allclose(longer.targets[:, :2], (data.inputs @ PIECES[0].T)[:, :2], atol=1e-9)
+    np.testing.assert_array_equal(longer.targets[:, 2], data.targets[:, 2])
+    assert longer.weights.min() < 0.2 < longer.weights.max() == 1.0
+
+
+@pytest.fixture(scope="module")
+def found():
+    data = labelled()
+    finder = PieceFinder(PieceLoss(ALL, (0, 1)), data, np.random.default_rng(0))
+    return data, finder, finder.find()
+
+
+def test_pieces_are_found_with_their_inputs_and_numbers(found):
+    _, finder, pieces = found
+    assert len(pieces) == 3
+    assert finder.explained(pieces) > 0.98
+    for known in PIECES:
+        nearest = min(pieces, key=lambda piece: np.abs(piece - known).sum())
+        np.testing.assert_array_equal(nearest[:, :-1] != 0, known[:, :-1] != 0)
+        np.testing.assert_allclose(nearest, known, atol=0.05)
+    assert finder.explained(pieces[:0]) == 0.0
+    assert finder.explained(finder.find(known=list(pieces))) > 0.98
+
+
+def test_noise_is_not_made_of_pieces(found):
+    data, _, _ = found
+    rng = np.random.default_rng(0)
+    noise = Data(data.inputs, rng.uniform(-1, 1, data.targets.shape), data.weights)
+    finder = PieceFinder(PieceLoss(ALL), noise, rng)
+    assert finder.explained(finder.find()) < 0.2
+
+
+def test_order_has_the_known_conditions(found):
+    data, finder, pieces = found
+    ordering = Ordering(data, finder.loss.matrix(data, pieces), most=6)
+    order = ordering.fit()
+    assert 2 <= len(order.conditions) <= 4
+    for known in CONDITIONS:
+        nearest = max(order.conditions, key=lambda one: _cosine(one, known))
+        assert _cosine(nearest, known) > 0.98
+    fresh = labelled(seed=1)
+    own = DecisionList(np.array(order.conditions), pieces[list(order.pieces)])
+    losses = finder.loss.matrix(fresh, own.controllers)
+    assert losses[np.arange(len(fresh)), own.branches(fresh.inputs)].mean() < 0.02
+    again = ordering.fit(order)
+    assert ordering.cost(again) <= ordering.cost(order)
+    assert len(ordering.fit(Order((), (0,))).conditions) >= 2
+    assert Ordering(data, finder.loss.matrix(data, pieces), most=1).fit().conditions == ()
+
+
+def _cosine(one, other):
+    return one @ other / np.linalg.norm(one) / np.linalg.norm(other)
+
+
+def test_order_grows_and_shrinks():
+    order = Order((np.array([1.0]), np.array([2.0])), (4, 5, 6))
+    assert order.insert(2, np.array([3.0]), 7).pieces == (4, 5, 7, 6)
+    assert [[float(c[0]) for c in one.conditions] for one in map(order.without, range(3))] == [[2], [1], [1]]
+    assert [one.pieces for one in map(order.without, range(3))] == [(5, 6), (4, 6), (4, 5)]
+
+
+def test_losses_of_the_rest_are_those_of_the_branch_that_acts():
+    losses, holds = np.array([[1.0, 2, 3], [1, 2, 3], [1, 2, 3]]), np.array([[1, 1], [0, 1], [0, 0]], dtype=bool)
+    np.testing.assert_array_equal(rest_losses(losses, holds), [[1, 2, 3], [2, 2, 3], [3, 3, 3]])
+
+
+def test_condition_has_the_inputs_that_are_worth_their_price():
+    rng = np.random.default_rng(0)
+    inputs = np.column_stack([rng.normal(size=(2000, 6)), np.ones(2000)])
+    gains = np.where(inputs[:, 1] + 0.1 * inputs[:, 3] > 0.2, 1.0, -1.0) / 2000
+    start = np.ones(7)
+    cheap, gained = fit_priced_condition(inputs, gains, start, price=1e-4)
+    dear, less = fit_priced_condition(inputs, gains, start, price=0.1)
+    assert np.flatnonzero(cheap[:-1]).tolist() == [1, 3]
+    assert np.flatnonzero(dear[:-1]).tolist() == [1]
+    assert gained == pytest.approx(gains[gains > 0].sum() - 2e-4, abs=2e-3)
+    assert less < gained
+    assert fit_priced_condition(inputs, -np.abs(gains), start, price=0.0) == (None, 0.0)
+
+
+def test_learner_makes_a_plain_list_of_box_labels_alone():
+    spec = ActionSpec("box", (3,), (-1.0,) * 3, (1.0,) * 3)
+    codec = ActionCodec(spec, ("move_x", "move_y", "open"))
+    learner = Learner(codec, np.ones(N_INPUTS, dtype=bool), Settings(max_branches=6, seed=0))
+    data = labelled()
+    learner.add(data.inputs[:, :-1].astype(np.float32), data.targets, data.weights)
+    plain, tuned = learner.plain(fresh=True)
+    assert learner.plain_raw is plain
+    assert 3 <= plain.n_branches <= 5
+    np.testing.assert_array_equal(plain.controllers[..., :-1] != 0, tuned.controllers[..., :-1] != 0)
+    assert learner.loss_of(tuned) <= learner.loss_of(plain) + 0.01 < 0.1
+    assert learner.plain(fresh=False)[0].n_branches == plain.n_branches
+    discrete = Learner(ActionCodec(ActionSpec("discrete", (3,)), ("a", "b", "c")), np.ones(4, bool), Settings(3, 0))
+    assert discrete.plain(fresh=True) == []
+
+
+def test_reaching_is_imitated_by_a_few_numbers():
+    program = imitate("planner", "PandaReach-v0", n_timesteps=4000, n_episodes=6, max_conditions=0, n_envs=6)
+    assert len(program.conditions) == 0
+    from sb3_progpolicy.analysis.rules import count_numbers
+
+    assert count_numbers(program) <= 10
+
+
+@pytest.mark.parametrize("beyond", [1.0, 0.5], ids=["as good beyond", "worse beyond"])
+def test_plain_list_is_taken_only_if_it_is_as_good_on_validation_variations(monkeypatch, beyond):
+    with Pool("PandaReach-v0", 4) as pool:
+        codec = ActionCodec(pool.spec, ("move_x", "move_y", "move_z", "open"))
+        judge = Judge(pool, [{"n_targets": 1}], 4, 0.015, make_teacher("planner", pool.envs[0]))
+    best, worse, plain = (DecisionList(np.zeros((0, 33)), np.full((1, 4, 33), value)) for value in (0.0, 1.0, 2.0))
+
+    class Plain:
+        raw = best
+
+        def plain(self, fresh):
+            return [plain, worse]
+
+    selection = Selection(Plain(), judge, validation_variations("PandaReach-v0"), codec, False)
+    selection.best, selection.reference = (1.0, best), 1.0
+    scores, asked = iter([0.9, 0.8]), []
+    monkeypatch.setattr(judge, "score", lambda act, needed=None: next(scores, 1.0))
+    judge.last_result = {"success": 1.0}
+
+    def at_length(act, variations=()):
+        asked.append(dict(variations[0]) if variations else None)
+        return beyond if len(asked) > 2 and variations else 1.0
+
+    monkeypatch.setattr(judge, "score_at_length", at_length)
+    selection.make_plain(fresh=True)
+    assert selection.learner.raw is plain
+    assert [one for _, one in selection.plain] == [plain, worse]
+    selection.choose_plain()
+    assert asked == [None, {"n_targets": 4}] * 3
+    assert selection.is_plain == (beyond == 1.0)
+    assert selection.best[1] is (plain if beyond == 1.0 else best)
+    assert selection.learner.raw is selection.best[1]
