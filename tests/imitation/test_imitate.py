@@ -157,11 +157,12 @@ def test_branches_that_hardly_ever_act_go_while_episodes_stay_as_good():
         run.learner.add(states, run.codec.encode(balance(states)), np.ones(500))
         rule = np.array([[-0.1, -0.5, -1, -1, 0], [0.1, 0.5, 1, 1, 0]]) * 20
         rare = DecisionList(np.array([[0, 0, 0, 0, -1.0], [0, 0, 0, 0, 1.0]]), np.array([rule, rule, rule]))
-        run.best = run._score(rare), rare
-        run._drop_rare_branches()
+        selection = run.selection
+        selection.best = selection.score(rare), rare
+        selection.drop_rare_branches()
     assert run.learner.rare_branches(rare, 0.03) == [0, 2]
-    assert run.best[1].n_branches == 1
-    assert run.result["return"] == 500
+    assert selection.best[1].n_branches == 1
+    assert selection.result["return"] == 500
 
 
 def test_planner_is_imitated_on_training_variations_only(monkeypatch):

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from sb3_progpolicy.analysis.rules import count_numbers
 from sb3_progpolicy.imitation import imitate
 from sb3_progpolicy.imitation.actions import ActionCodec
+from sb3_progpolicy.imitation.algorithm import N_ROUNDS
 from sb3_progpolicy.imitation.conditions import fit_priced_condition
 from sb3_progpolicy.imitation.decision_list import Data, DecisionList, rest_losses
 from sb3_progpolicy.imitation.judge import Judge
@@ -152,12 +154,29 @@ def test_learner_makes_a_plain_list_of_box_labels_alone():
     assert discrete.plain(fresh=True) == []
 
 
-def test_reaching_is_imitated_by_a_few_numbers():
-    program = imitate("planner", "PandaReach-v0", n_timesteps=4000, n_episodes=6, max_conditions=0, n_envs=6)
-    assert len(program.conditions) == 0
-    from sb3_progpolicy.analysis.rules import count_numbers
+def test_reaching_is_imitated_by_a_few_numbers_and_goes_on_after_an_interruption(monkeypatch, tmp_path):
+    seen, reset = set(), Pool.reset
 
-    assert count_numbers(program) <= 10
+    def spy(self, row, seed, variation):
+        seen.add(tuple(variation.items()))
+        reset(self, row, seed, variation)
+
+    monkeypatch.setattr(Pool, "reset", spy)
+    arguments = {"n_timesteps": 4000, "n_episodes": 6, "max_conditions": 0, "n_envs": 6}
+    whole = imitate("planner", "PandaReach-v0", **arguments)
+    assert len(whole.conditions) == 0
+    assert count_numbers(whole) <= 10
+    assert seen == {(("n_targets", n),) for n in (1, 2, 3, 4)}  # trained on 1 to 3; 4 are the validation's
+
+    def interrupt(progress):
+        if progress.round == N_ROUNDS + 1:
+            raise KeyboardInterrupt
+
+    state = tmp_path / "state.npz"
+    with pytest.raises(KeyboardInterrupt):
+        imitate("planner", "PandaReach-v0", **arguments, callback=interrupt, checkpoint=state)
+    resumed = imitate("planner", "PandaReach-v0", **arguments, checkpoint=state)
+    assert resumed.body == whole.body
 
 
 @pytest.mark.parametrize("beyond", [1.0, 0.5], ids=["as good beyond", "worse beyond"])
