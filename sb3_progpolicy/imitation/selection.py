@@ -92,7 +92,9 @@ class Selection:
         if not self.plain:
             return
         dense, *merits = (self._merit(candidate) for _, candidate in (self.best, *self.plain))
-        index = max(range(len(merits)), key=lambda one: merits[one])
+        most = max(merits)
+        as_good = [index for index, merit in enumerate(merits) if all(map(self.judge.as_good, merit, most))]
+        index = min(as_good, key=lambda one: _n_numbers(self.plain[one][1]))
         loss = self.learner.loss_of if self.augmented else lambda _: 0.0
         needed = dense[0] - loss(self.best[1]) + loss(self.plain[index][1])
         if self.judge.as_good(merits[index][0], needed) and self.judge.as_good(merits[index][1], dense[1]):
@@ -159,3 +161,8 @@ class Selection:
         """Return the score less the loss where states were labelled that no episode comes to, else the score."""
         score, candidate = scored
         return score - self.learner.loss_of(candidate) if self.augmented else score
+
+
+def _n_numbers(raw: DecisionList) -> int:
+    """Return how many numbers of a list are not 0."""
+    return int(np.count_nonzero(raw.conditions) + np.count_nonzero(raw.controllers))
