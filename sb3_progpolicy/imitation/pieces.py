@@ -130,8 +130,8 @@ class PieceFinder:
             unexplained &= ~self._exact(pieces[-1])
         while len(pieces) < _MOST + 4 and unexplained.mean() >= _UNEXPLAINED:
             best, most = None, _LEAST
-            for state in self.rng.choice(np.flatnonzero(unexplained), _TRIES):
-                piece = self._around(int(state))
+            for index, state in enumerate(self.rng.choice(np.flatnonzero(unexplained), _TRIES)):
+                piece = self._around(int(state), trimmed=index % 2 == 1)
                 exact = self._exact(piece)
                 gain = float(self.shares[exact & unexplained].sum()) - _price(piece)
                 if gain > most:
@@ -151,12 +151,17 @@ class PieceFinder:
     def _exact(self, piece: Floats) -> np.ndarray:
         return np.asarray(self.loss.matrix(self.data, piece[None])[:, 0] < EXACT)
 
-    def _around(self, state: int) -> Floats:
-        """Return the piece that explains a state and its neighbours, fitted to all states in which it is exact."""
+    def _around(self, state: int, trimmed: bool) -> Floats:
+        """Return the piece that explains a state and its neighbours, fitted to all states in which it is exact.
+
+        :param state: index
+        :param trimmed: whether only the half of the neighbours that fits best is kept, since others may be of another
+            piece; the fewer that are left say less
+        """
         distances = ((self._places - self._places[state]) ** 2).sum(axis=1)
         size = min(_NEIGHBOURS, len(distances))
         near = self.data.take(np.argpartition(distances, size - 1)[:size])
-        for _ in range(2):  # neighbours may be of another piece: only the half that fits best is kept
+        if trimmed:
             losses = self.loss.matrix(near, self.loss.fit(near)[None])[:, 0]
             near = near.take(losses <= np.median(losses))
         return self._widened(self.loss.fit_few(near, self.loss.fit(near), refit=False), _WIDENING)
