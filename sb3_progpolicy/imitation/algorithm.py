@@ -170,7 +170,7 @@ class _Run:
         readable = np.array([name not in ignore for name in self.inputs])
         self.learner = Learner(self.codec, readable, Settings(max_branches, seed))
         beyond = validation_variations(env_id) if tasks is None else ()
-        self.selection = Selection(self.learner, self.judge, beyond, self.codec, augment is not None)
+        self.selection = Selection(self.learner, self.judge, beyond, self.codec, self.augmentation is not None)
         self.n_labelled = 0
         #: Teachers with continuous actions may be made of pieces.
         self.n_plain_rounds = N_PLAIN_ROUNDS if self.spec.kind == "box" else 0

@@ -6,7 +6,7 @@ import pytest
 from sb3_progpolicy.analysis.rules import count_numbers
 from sb3_progpolicy.imitation import imitate
 from sb3_progpolicy.imitation.actions import ActionCodec
-from sb3_progpolicy.imitation.algorithm import N_ROUNDS
+from sb3_progpolicy.imitation.algorithm import N_ROUNDS, _Run
 from sb3_progpolicy.imitation.conditions import fit_priced_condition
 from sb3_progpolicy.imitation.decision_list import Data, DecisionList, rest_losses
 from sb3_progpolicy.imitation.judge import Judge
@@ -211,3 +211,11 @@ def test_plain_list_is_taken_only_if_it_is_as_good_on_validation_variations(monk
     assert selection.is_plain == (beyond == 1.0)
     assert selection.best[1] is (plain if beyond == 1.0 else best)
     assert selection.learner.raw is selection.best[1]
+
+
+def test_only_states_that_no_episode_comes_to_count_beside_the_episodes():
+    with Pool("PandaStack-v0", 2) as pool:
+        arguments = (pool, "planner", "PandaStack-v0", [{"n_objects": 1}], 0, 3, (), 2, 0.015)
+        runs = {augment: _Run(*arguments, augment) for augment in (None, "begun_towers", "taller_towers")}
+    assert [run.selection.augmented for run in runs.values()] == [False, False, True]
+    assert [len(run.selection.beyond) for run in runs.values()] == [0, 0, 0]  # given tasks have no validation set
