@@ -86,18 +86,19 @@ class Selection:
             self.plain = sorted([*plain, *self.plain], key=lambda one: one[0], reverse=True)[:_FINALISTS]
 
     def choose_plain(self) -> None:
-        """Go on with the best plain list if its episodes are as good as the best list's, also beyond training."""
+        """Go on with the smallest of the best plain lists if its episodes are as good as the best list's.
+
+        Episodes beyond training count as much as those of training.
+        """
         assert self.best is not None
         self.learner.raw = self.best[1]
         if not self.plain:
             return
         dense, *merits = (self._merit(candidate) for _, candidate in (self.best, *self.plain))
-        most = max(merits)
-        as_good = [index for index, merit in enumerate(merits) if all(map(self.judge.as_good, merit, most))]
+        as_good = [index for index, merit in enumerate(merits) if self.judge.as_good(merit, max(merits))]
         index = min(as_good, key=lambda one: _n_numbers(self.plain[one][1]))
         loss = self.learner.loss_of if self.augmented else lambda _: 0.0
-        needed = dense[0] - loss(self.best[1]) + loss(self.plain[index][1])
-        if self.judge.as_good(merits[index][0], needed) and self.judge.as_good(merits[index][1], dense[1]):
+        if self.judge.as_good(merits[index] - loss(self.plain[index][1]), dense - loss(self.best[1])):
             self.best, self.is_plain = self.plain[index], True
             self.learner.raw, self.reference = self.best[1], self.best[0]
             self.score(self.best[1])
@@ -137,10 +138,13 @@ class Selection:
         """Return the score of a list's episodes; see :meth:`~sb3_progpolicy.imitation.judge.Judge.score`."""
         return self.judge.score(self.codec.act_of(raw), needed)
 
-    def _merit(self, candidate: DecisionList) -> tuple[float, float]:
-        """Return the scores of many episodes on training variations and on validation variations, 0 without these."""
+    def _merit(self, candidate: DecisionList) -> float:
+        """Return the score of many episodes, the mean of training and validation variations where there are these."""
         act = self.codec.act_of(candidate)
-        return self.judge.score_at_length(act), self.judge.score_at_length(act, self.beyond) if self.beyond else 0.0
+        scores = [self.judge.score_at_length(act)]
+        if self.beyond:
+            scores.append(self.judge.score_at_length(act, self.beyond))
+        return float(np.mean(scores))
 
     def _take_over(self, candidate: DecisionList) -> float | None:
         """Go on with a smaller list if its loss is not far from the best one's and its episodes are as good.
