@@ -84,13 +84,14 @@ def imitate(
     States are visited by a mixture of teacher and student whose share of the teacher falls to 0, and labelled by the
     teacher (DAgger, Ross et al. 2011). The program with the best episodes on training variations is made plain, or
     sparse, and round, as far as its episodes stay as good. A plain program, whose controllers are pieces of what the
-    teacher does, is taken if it is as good on the domain's validation variations, too; unseen ones are not looked at.
+    teacher does, is taken if the mean of its scores on these and on the domain's validation variations is as good;
+    unseen variations are not looked at.
 
     :param teacher: ``"planner"``, a model of Stable-Baselines3 or sb3-contrib, or a function from observations
         ``(n_envs, n_observations)`` to actions
     :param env_id: environment id
     :param tasks: variations to learn on, the easiest first; by default those that the domain is trained on
-    :param n_timesteps: states to label
+    :param n_timesteps: states to label, at most
     :param max_conditions: of the program at most
     :param cell: of the conditions: ``"affine"``, or ``"gru"``, a memory of one unit each, where the teacher's action is
         not a function of the present input

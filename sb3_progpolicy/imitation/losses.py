@@ -12,8 +12,8 @@ from sb3_progpolicy.imitation.decision_list import Data, DecisionList, Floats
 if TYPE_CHECKING:
     import torch as th
 
-_DELTA = 0.1  # Huber's: errors beyond it count by their size, not its square
-_SATURATED = 0.999
+DELTA = 0.1  # Huber's: errors beyond it count by their size, not its square
+SATURATED = 0.999
 _OVERSHOOT = 0.15  # weight of too much along a direction that the teacher has shortened to fit into the bounds
 _SMALL = 0.1  # labels up to it count as meant, not as shortened
 _MAX_NATS = 3.0  # a wrong decision costs no more than this, however sure it is
@@ -57,7 +57,7 @@ def mean_loss(loss: Loss, program: DecisionList, data: Data) -> float:
 
 def huber(sizes: Floats) -> Floats:
     """Return Huber's loss of the sizes of errors."""
-    return np.where(sizes < _DELTA, 0.5 * sizes * sizes / _DELTA, sizes - 0.5 * _DELTA)
+    return np.where(sizes < DELTA, 0.5 * sizes * sizes / DELTA, sizes - 0.5 * DELTA)
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class BoxLoss:
         sparse = full.copy()
         for output in range(len(full)):
             weights = data.weights * np.maximum(self.reweighted(data, full[output], output, slack), 0.02)
-            hessian = (data.inputs * weights[:, None]).T @ data.inputs / _DELTA + 1e-5 * len(data) * np.eye(width)
+            hessian = (data.inputs * weights[:, None]).T @ data.inputs / DELTA + 1e-5 * len(data) * np.eye(width)
             supports = eliminate(hessian, full[output])
             limit = self.of_output(data, full[output], output, slack) + tolerance
             least = np.inf
@@ -133,7 +133,7 @@ class BoxLoss:
         outputs = th.where(th.as_tensor(self.bounded), leaky, outputs)
         errors = outputs - targets[:, None]
         sizes = errors.abs()
-        losses = th.where(sizes < _DELTA, 0.5 * sizes * sizes / _DELTA, sizes - 0.5 * _DELTA)
+        losses = th.where(sizes < DELTA, 0.5 * sizes * sizes / DELTA, sizes - 0.5 * DELTA)
         if self.direction:
             slack = th.as_tensor(self._slack(targets.numpy().astype(np.float64)), dtype=losses.dtype)
             losses = th.where(errors * targets.sign()[:, None] > 0, losses * slack[:, None], losses)
@@ -144,7 +144,7 @@ class BoxLoss:
         slack = np.ones_like(targets)
         if self.direction:
             columns = list(self.direction)
-            saturated = np.abs(targets[:, columns]) >= _SATURATED
+            saturated = np.abs(targets[:, columns]) >= SATURATED
             shortened = saturated.any(axis=1, keepdims=True) & ~saturated & (np.abs(targets[:, columns]) > _SMALL)
             slack[:, columns] = np.where(shortened, _OVERSHOOT, 1.0)
         return slack
@@ -154,10 +154,10 @@ class BoxLoss:
         target = data.targets[:, output]
         errors = data.inputs @ row - target
         over = errors * np.sign(target) > 0
-        weights = _DELTA / np.maximum(np.abs(errors), _DELTA)
+        weights = DELTA / np.maximum(np.abs(errors), DELTA)
         weights = np.where(over, weights * slack[:, output], weights)
         if self.bounded[output]:
-            weights = np.where(over & (np.abs(target) >= _SATURATED), 0.0, weights)
+            weights = np.where(over & (np.abs(target) >= SATURATED), 0.0, weights)
         return weights
 
     def of_output(self, data: Data, row: Floats, output: int, slack: Floats) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_progpolicy.imitation.conditions import fit_condition, fit_priced_condition
-from sb3_progpolicy.imitation.decision_list import Data, DecisionList, Floats, rest_losses
+from sb3_progpolicy.imitation.decision_list import Data, Floats, rest_losses
 
 PRICE = 0.001  # of an input of a condition, in mean loss
 _WORTH = 0.001  # mean loss that a branch has to take away beyond the price of its condition
@@ -117,9 +117,7 @@ class Ordering:
             if condition is not None and gain > old:
                 conditions[index] = condition
         order = Order(tuple(conditions), order.pieces)
-        acting = DecisionList(
-            np.array(conditions).reshape(-1, self.inputs.shape[1]), np.zeros((len(order.pieces), 0, 0))
-        ).branches(self.inputs)
+        acting = np.column_stack([self._holds(order), np.ones(len(self.inputs), dtype=bool)]).argmax(axis=1)
         pieces = [
             int((self.shares[here] @ self.losses[here]).argmin()) if (here := acting == branch).any() else piece
             for branch, piece in enumerate(order.pieces)

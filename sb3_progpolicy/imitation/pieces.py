@@ -12,17 +12,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_progpolicy.imitation.decision_list import Data, Floats
-from sb3_progpolicy.imitation.losses import BoxLoss, eliminate, huber
+from sb3_progpolicy.imitation.losses import DELTA, SATURATED, BoxLoss, eliminate, huber
 
 EXACT = 0.02  # loss of a piece in a state in which it is what the teacher does
 _WIDENING = (0.06, 0.03, EXACT, EXACT)  # losses up to which states belong to a piece that is being found
 _NEIGHBOURS, _STATES = 80, 2_500
 _INPUTS = (0, 1, 2, 3, 4)  # of an output
 _PRICE = 0.002  # of an input, in the mean loss of its output
+_SHARE = 0.001  # of the states that each input of a piece has to be worth
+_FEWEST = 30  # states that a piece is fitted again to
 _TRIES = 16  # states that a piece is looked for from
 _LEAST, _MOST = 0.003, 12  # share of the states that a piece adds; number of pieces
 _UNEXPLAINED = 0.01  # share of the states that are left over
-_SATURATED = 0.999
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ class PieceLoss:
         if not self.direction:
             return data
         vector = np.abs(data.inputs @ controller[self._columns].T).max(axis=1)
-        shortened = (np.abs(data.targets[:, self._columns]) >= _SATURATED).any(axis=1)
+        shortened = (np.abs(data.targets[:, self._columns]) >= SATURATED).any(axis=1)
         factors = np.where(shortened, np.maximum(vector, 1.0), 1.0)
         targets = data.targets.copy()
         targets[:, self._columns] *= factors[:, None]
@@ -94,7 +95,7 @@ class PieceLoss:
         few = np.zeros_like(full)
         for output, row in enumerate(full):
             weights = data.weights * np.maximum(self._free.reweighted(data, row, output, slack), 0.02)
-            hessian = 10.0 * (data.inputs * weights[:, None]).T @ data.inputs
+            hessian = (data.inputs * weights[:, None]).T @ data.inputs / DELTA
             path = eliminate(hessian + 1e-5 * len(data) * np.eye(len(row)), row)
             least = np.inf
             for size in _INPUTS:
@@ -169,7 +170,7 @@ class PieceFinder:
     def _widened(self, piece: Floats, limits: Sequence[float]) -> Floats:
         for limit in limits:
             rows = np.flatnonzero(self.loss.matrix(self.data, piece[None])[:, 0] < limit)
-            if len(rows) < 30:
+            if len(rows) < _FEWEST:
                 return piece
             if len(rows) > _STATES:
                 rows = self.rng.choice(rows, _STATES, replace=False)
@@ -198,4 +199,4 @@ class PieceFinder:
 
 def _price(piece: Floats) -> float:
     """Return the share of the states that the inputs of a piece have to be worth."""
-    return 0.001 * float(np.count_nonzero(piece[:, :-1]))
+    return _SHARE * float(np.count_nonzero(piece[:, :-1]))
