@@ -1,7 +1,7 @@
-"""Several seeds of imitating a domain's planner, or a network that PPO has trained.
+"""Several seeds of imitating a domain's planner, or a network that PPO has trained (``teachers.yml``).
 
     python benchmarks/imitation_seeds.py --env PandaPush-v0 [--seeds 10] [--episodes 100] [--final]
-    python benchmarks/imitation_seeds.py --env CartPole-v1 --ppo 60000
+    python benchmarks/imitation_seeds.py --env CartPole-v1 --network
     python benchmarks/imitation_seeds.py --env HikingEgo-v0 --interaction --set n_stars=1-4 layout=random
 
 Each seed imitates from scratch, on training variations alone. Its program is then run crisp on these, on starts that
@@ -25,7 +25,11 @@ from typing import Any
 
 import numpy as np
 import torch as th
+import yaml
 from rich.progress import track
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from study import RESULTS, commit, write_results
 
 from progpolicy_envs import find_domain
@@ -42,6 +46,7 @@ COLUMNS = (
 )
 EVALUATION_SEED = 10_000
 PROGRAMS = RESULTS / "programs"
+TEACHERS = Path(__file__).with_name("teachers.yml")
 
 
 def learn(teacher: Any, env_id: str, seed: int, folder: Path, arguments: dict[str, Any]) -> Program:
@@ -162,16 +167,27 @@ def learned_by(program: Program) -> str:
     return program.learned_by + (f", {augmentation}" if augmentation else "")
 
 
-def trained_ppo(env_id: str, n_timesteps: int, folder: Path) -> Any:
-    """Return SB3's PPO with an ``MlpPolicy``, trained now with its default settings or read from ``folder``."""
-    from stable_baselines3 import PPO
+def trained_network(env_id: str, folder: Path) -> Any:
+    """Return SB3's PPO as ``teachers.yml`` says, trained now with seed 0 or read from ``folder``.
 
-    path = folder / f"ppo_{n_timesteps}.zip"
+    :raises ValueError: if it does not name the environment
+    """
+    known = yaml.safe_load(TEACHERS.read_text())
+    if env_id not in known:
+        raise ValueError(f"{TEACHERS.name} has no network for {env_id}; it has {', '.join(known)}")
+    settings = dict(known[env_id])
+    path, statistics = folder / "teacher.zip", folder / "teacher.pkl"
+    n_timesteps, normalize = settings.pop("n_timesteps"), settings.pop("normalize", False)
+    env: VecEnv = make_vec_env(env_id, settings.pop("n_envs"), seed=0)
     if path.exists():
-        return PPO.load(path, device="cpu")
+        return PPO.load(path, VecNormalize.load(str(statistics), env) if normalize else env, device="cpu")
     folder.mkdir(parents=True, exist_ok=True)
-    model = PPO("MlpPolicy", env_id, seed=0, device="cpu").learn(n_timesteps)
-    model.save(path)
+    env = VecNormalize(env, gamma=settings["gamma"]) if normalize else env
+    model = PPO("MlpPolicy", env, seed=0, device="cpu", **settings).learn(n_timesteps)
+    if isinstance(env, VecNormalize):
+        env.save(str(statistics))
+    model.save(path.with_name("unfinished.zip"))
+    path.with_name("unfinished.zip").replace(path)
     return model
 
 
@@ -181,12 +197,12 @@ def main() -> None:
     parser.add_argument("--env", required=True, help="environment id")
     parser.add_argument("--seeds", type=int, default=10, help="number of seeds, from 0 on")
     parser.add_argument("--episodes", type=int, default=100, help="episodes on each variation")
-    parser.add_argument("--n-timesteps", type=int, default=24_000, help="states to label")
+    parser.add_argument("--n-timesteps", type=int, default=30_000, help="states to label")
     parser.add_argument("--max-conditions", type=int, default=11, help="of the program at most")
     parser.add_argument("--interaction", action="store_true", help="read the previous action, reward and done flag")
     parser.add_argument("--set", nargs="+", help="variations to learn on, as name=value; by default the training ones")
     parser.add_argument("--augment", help="more than the training variations: taller_towers or begun_towers")
-    parser.add_argument("--ppo", type=int, help="imitate a network that PPO has trained for so many steps")
+    parser.add_argument("--network", action="store_true", help="imitate the network that teachers.yml describes")
     parser.add_argument("--final", action="store_true", help="look at the validation and the unseen variations, too")
     parser.add_argument("--sizes", type=int, nargs="+", help="sizes to run on; by default all")
     parser.add_argument("--name", help="name of the result files; that of the domain by default")
@@ -202,7 +218,7 @@ def main() -> None:
     }
     if options.set:
         arguments["tasks"] = parse_variations(options.set)
-    teacher = trained_ppo(options.env, options.ppo, folder) if options.ppo else "planner"
+    teacher = trained_network(options.env, folder) if options.network else "planner"
     wanted = wanted_variations(options.env, options.final, options.sizes)
     known = known_rows(name, arguments, options.episodes, wanted)
     rows: list[dict[str, Any]] = []

@@ -72,6 +72,7 @@ def learn(
         observations.append(visits.inputs)
         targets.append(codec.encode(visits.actions))
         known = np.concatenate(observations)
+        collector.stalls.deviations = known.std(axis=0)
         scaler = Scaler.of(known, readable)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a network that has not converged
@@ -89,7 +90,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", required=True, help="environment id of a domain with a planner")
     parser.add_argument("--branches", type=int, default=9, help="leaves of the small tree")
-    parser.add_argument("--n-timesteps", type=int, default=24_000, help="states to label")
+    parser.add_argument("--n-timesteps", type=int, default=30_000, help="states to label")
     parser.add_argument("--episodes", type=int, default=100, help="episodes on each variation")
     parser.add_argument("--augment", help="more than the training variations: taller_towers or begun_towers")
     parser.add_argument("--seed", type=int, default=0, help="of all draws")

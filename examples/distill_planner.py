@@ -1,6 +1,6 @@
 """Turn a scripted controller into one program, here that of a robot that pushes blocks.
 
-python examples/distill_planner.py [--env PandaPush-v0] [--timesteps 24000]
+python examples/distill_planner.py [--env PandaPush-v0] [--timesteps 30000]
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from sb3_progpolicy import compare_with_teacher, imitate
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--env", default="PandaPush-v0", help="id of a domain with a planner")
-parser.add_argument("--timesteps", type=int, default=24_000, help="states to label")
+parser.add_argument("--timesteps", type=int, default=30_000, help="states to label")
 parser.add_argument("--max-conditions", type=int, default=11, help="of the program at most")
 arguments = parser.parse_args()
 th.set_num_threads(1)

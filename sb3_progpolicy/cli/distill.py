@@ -25,7 +25,7 @@ def distill(
     variations: Annotated[
         list[str] | None, typer.Option("--set", help="variations to learn on; by default the training ones")
     ] = None,
-    n_timesteps: Annotated[int, typer.Option("--n-timesteps", "-n", min=1, help="states to label")] = 24_000,
+    n_timesteps: Annotated[int, typer.Option("--n-timesteps", "-n", min=1, help="states to label")] = 30_000,
     max_conditions: Annotated[int, typer.Option("--max-conditions", min=0, help="of the program at most")] = 11,
     cell: Annotated[str, typer.Option("--cell", help="of the conditions: affine, or gru, which remembers")] = "affine",
     seed: Annotated[int, typer.Option("--seed", min=0, help="of all draws")] = 0,

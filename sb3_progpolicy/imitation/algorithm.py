@@ -28,7 +28,8 @@ from sb3_progpolicy.spaces import action_spec
 
 #: Share of the teacher in each round; 0 in all later ones.
 TEACHER_SHARES = (1.0, 0.6, 0.4, 0.3, 0.2, 0.1)
-N_ROUNDS, N_PLAIN_ROUNDS, N_SPARSE_ROUNDS = 9, 3, 3
+N_ROUNDS, N_PLAIN_ROUNDS, N_SPARSE_ROUNDS = 9, 10, 3
+_FEWEST_PLAIN_ROUNDS = 3  # before a plain list is taken
 _CHANGED = 0.02  # share of the actions, or mean distance, that rounding may change
 _DIGITS = (2, 3, 4, 6)
 #: Inputs that are not read by default: beyond the training sizes they take values that were never seen.
@@ -59,7 +60,7 @@ def imitate(
     teacher: TeacherLike,
     env_id: str,
     tasks: Variations | None = None,
-    n_timesteps: int = 24_000,
+    n_timesteps: int = 30_000,
     max_conditions: int = 11,
     cell: str = "affine",
     seed: int = 0,
@@ -290,6 +291,8 @@ class _Run:
         learner = self.learner
         self.collector.begin()
         share = TEACHER_SHARES[number] if number < len(TEACHER_SHARES) else 0.0
+        if learner.n_states:
+            self.collector.stalls.deviations = learner.observations.std(axis=0)
         student = None if learner.raw is None else self.codec.act_of(learner.raw)
         visits = self.collector.collect(n_steps * (1 if number else 2), student, share)
         targets = self.codec.encode(visits.actions) if visits.good is None else visits.good.astype(np.float64)
@@ -307,10 +310,11 @@ class _Run:
             selection.make_short()
         if number < n_before_sparse:
             selection.make_plain(fresh=(number - N_ROUNDS) % 2 == 1)
-            if number == n_before_sparse - 1:
+            last = number == n_before_sparse - 1
+            if last or (number >= N_ROUNDS + _FEWEST_PLAIN_ROUNDS - 1 and selection.plain_is_promising):
                 selection.choose_plain()
-                if not selection.is_plain:
-                    selection.make_sparse()
+            if last and not selection.is_plain:
+                selection.make_sparse()
         else:
             selection.offer(learner.refit_sparse(), sparse=True)
         if selection.is_plain or number == self.n_rounds - 1:

@@ -11,7 +11,7 @@ from sb3_progpolicy.imitation.losses import eliminate
 
 _SHARPNESS = 4.0  # of a condition whose values have a deviation of 1, taken for a logistic regression
 _SUPPORTS = (1, 2, 3, 4, 5, 6, 8, 10)
-_SAMPLE = 4_000  # states for a regression
+_SAMPLE = 2_000  # states for a regression
 
 
 def fit_condition(
@@ -175,7 +175,7 @@ def improve(inputs: Floats, gains: Floats, condition: Floats, cycles: int = 2) -
             moves = np.abs(column) > 1e-9
             # The weight at which each state begins to hold, where its input is positive, or ceases to.
             turns = condition[index] - values[moves] / column[moves]
-            order = np.argsort(turns, kind="stable")
+            order = np.argsort(turns)
             turns, signs = turns[order], np.sign(column[moves][order])
             moved = gains[moves][order]
             sums = moved[signs < 0].sum() + np.cumsum(signs * moved) + gains[~moves & (values >= 0)].sum()
@@ -235,8 +235,9 @@ def logistic(
 def _best_constant(inputs: Floats, weights: Floats, gains: Floats) -> tuple[Floats, float]:
     """Return the condition with the constant for which the sum of gains is largest, and that sum."""
     values = inputs @ weights
-    order = np.argsort(-values, kind="stable")
+    order = np.argsort(-values)
     ordered, sums = values[order], np.cumsum(gains[order])
+    sums[:-1][ordered[1:] == ordered[:-1]] = -np.inf  # no constant parts equal values
     last = int(sums.argmax())
     if sums[last] <= 0:
         threshold, best = ordered[0] + 1.0, 0.0

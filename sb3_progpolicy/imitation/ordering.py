@@ -82,18 +82,24 @@ class Ordering:
     def _with_one_more(self, order: Order) -> Order | None:
         """Return the order with the branch of the largest gain, whatever piece and position, if there is one."""
         rest, holds = self._rest(order), self._holds(order)
-        candidates = []
+        bounds = []  # of what each piece can gain at each position
         for position in range(len(order.pieces)):
             reached = _none(holds[:, :position])
-            for piece in range(self.losses.shape[1]):
-                gains = self.shares * (rest[position] - self.losses[:, piece])
-                here = self._matters(gains, reached)
-                if np.maximum(gains[here], 0).sum() < 2 * _WORTH:
-                    continue
-                condition, gain = fit_condition(self.inputs[here], gains[here], ridges=(1e-3,), cautions=(1.0,))
-                if condition is not None:
-                    candidates.append((gain, position, piece, condition))
-        candidates.sort(key=lambda candidate: -candidate[0])
+            gains = self.shares[:, None] * (rest[position][:, None] - self.losses)
+            most_gained = np.maximum(gains[reached], 0).sum(axis=0)
+            bounds += [(float(bound), position, piece) for piece, bound in enumerate(most_gained)]
+        bounds.sort(key=lambda one: -one[0])
+        candidates: list[tuple[float, int, int, Floats]] = []
+        for bound, position, piece in bounds:
+            least = candidates[_CLOSER - 1][0] if len(candidates) >= _CLOSER else 2 * _WORTH
+            if bound < least:
+                break
+            gains = self.shares * (rest[position] - self.losses[:, piece])
+            here = self._matters(gains, _none(holds[:, :position]))
+            condition, gain = fit_condition(self.inputs[here], gains[here], ridges=(1e-3,), cautions=(1.0,))
+            if condition is not None:
+                candidates.append((gain, position, piece, condition))
+                candidates.sort(key=lambda candidate: -candidate[0])
         best, most = None, _WORTH
         for _, position, piece, condition in candidates[:_CLOSER]:
             gains = self.shares * (rest[position] - self.losses[:, piece])

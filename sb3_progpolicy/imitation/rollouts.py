@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sb3_progpolicy.env_ids import spec_of
 from sb3_progpolicy.imitation.augmentation import Augment, Begin
+from sb3_progpolicy.imitation.stalls import VISITS, Stalls
 from sb3_progpolicy.imitation.teachers import Observations, PlannerTeacher, Situation, Teacher, join_history
 from sb3_progpolicy.programs.interpreter import ProgramRunner, Semantics
 from sb3_progpolicy.programs.syntax import ProgramData
@@ -20,7 +21,6 @@ from sb3_progpolicy.spaces import action_spec, check_observation_space
 Act = Callable[[Observations], NDArray[Any]]
 Variations = Sequence[Mapping[str, Any]]
 _SEGMENT = (5, 40)  # steps for which teacher or student act in turn
-_STALLED = 3  # visits of the same state that make a stall
 _RESCUE = 10  # steps of the teacher out of one
 STALL_WEIGHT = 3.0
 _STEPS_COUNT = 0.1  # a tenth more steps than the teacher's are as bad as one failure in a hundred
@@ -270,7 +270,7 @@ class Collector:
         self.limit = pool.cap if limit is None else limit
         self._guided, self._left = np.zeros(len(pool), dtype=bool), np.zeros(len(pool), dtype=np.int64)
         self._elapsed = np.zeros(len(pool), dtype=np.int64)
-        self._seen: list[dict[str | bytes, int]] = [{} for _ in range(len(pool))]
+        self.stalls = Stalls(len(pool))
         self._has_goal = False
 
     def begin(self) -> None:
@@ -335,20 +335,13 @@ class Collector:
         self.pool.dones[row] = self.pool.actions is not None
         self.next_seed += 1
         self._elapsed[row] = self._left[row] = 0
-        self._seen[row] = {}
+        self.stalls.forget(row)
 
     def _stalled(self) -> NDArray[np.bool_]:
         """Return which environments are in a state for the third time, or a later one, in this episode."""
         if not self._has_goal:
             return np.zeros(len(self.pool), dtype=bool)
-        counts = []
-        for seen, env, observation in zip(self._seen, self.pool.envs, self.pool.observations, strict=True):
-            # Where observations do not show all, states do.
-            state = getattr(env.unwrapped, "state", None)
-            key = repr(state) if isinstance(state, Mapping) else np.round(observation, 3).tobytes()
-            seen[key] = seen.get(key, 0) + 1
-            counts.append(seen[key])
-        return np.array(counts) >= _STALLED
+        return self.stalls.visits(self.pool.envs, self.pool.inputs) >= VISITS
 
     def _disturbed(self, actions: NDArray[Any]) -> NDArray[Any]:
         """Return the teacher's actions with some noise, so that it is seen to correct itself."""

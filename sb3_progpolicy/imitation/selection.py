@@ -43,6 +43,7 @@ class Selection:
         self.plain: list[Scored] = []
         #: Whether a plain list was taken over.
         self.is_plain = False
+        self._merits: dict[bytes, float] = {}
 
     def offer(self, candidate: DecisionList, sparse: bool = False) -> None:
         """Keep a candidate if its episodes are better than the best so far.
@@ -79,11 +80,17 @@ class Selection:
 
         :param fresh: whether to look for one from nothing, too
         """
-        plain = [(self.score(candidate), candidate) for candidate in self.learner.plain(fresh)]
+        assert self.best is not None
+        plain = [(self.score(candidate, self.best[0]), candidate) for candidate in self.learner.plain(fresh)]
         if plain:
             self.learner.raw = max(plain, key=lambda one: one[0])[1]
             # Of equal ones the later: it has seen more.
             self.plain = sorted([*plain, *self.plain], key=lambda one: one[0], reverse=True)[:_FINALISTS]
+
+    @property
+    def plain_is_promising(self) -> bool:
+        """Whether the episodes of a plain list are as good as the best list's."""
+        return self.best is not None and bool(self.plain) and self.judge.as_good(self.plain[0][0], self.best[0])
 
     def choose_plain(self) -> None:
         """Go on with the smallest of the best plain lists if its episodes are as good as the best list's.
@@ -91,7 +98,6 @@ class Selection:
         Episodes beyond training count as much as those of training.
         """
         assert self.best is not None
-        self.learner.raw = self.best[1]
         if not self.plain:
             return
         dense, *merits = (self._merit(candidate) for _, candidate in (self.best, *self.plain))
@@ -140,11 +146,14 @@ class Selection:
 
     def _merit(self, candidate: DecisionList) -> float:
         """Return the score of many episodes, the mean of training and validation variations where there are these."""
-        act = self.codec.act_of(candidate)
-        scores = [self.judge.score_at_length(act)]
-        if self.beyond:
-            scores.append(self.judge.score_at_length(act, self.beyond))
-        return float(np.mean(scores))
+        key = candidate.conditions.tobytes() + candidate.controllers.tobytes()
+        if key not in self._merits:
+            act = self.codec.act_of(candidate)
+            scores = [self.judge.score_at_length(act)]
+            if self.beyond:
+                scores.append(self.judge.score_at_length(act, self.beyond))
+            self._merits[key] = float(np.mean(scores))
+        return self._merits[key]
 
     def _take_over(self, candidate: DecisionList) -> float | None:
         """Go on with a smaller list if its loss is not far from the best one's and its episodes are as good.

@@ -210,7 +210,7 @@ def test_plain_list_is_taken_only_if_it_is_as_good_on_validation_variations(monk
     assert asked == [None, {"n_targets": 4}] * 3
     assert selection.is_plain == (beyond == 1.0)
     assert selection.best[1] is (plain if beyond == 1.0 else best)
-    assert selection.learner.raw is selection.best[1]
+    assert selection.learner.raw is plain  # the states that it visits are those to learn from
 
 
 def test_only_states_that_no_episode_comes_to_count_beside_the_episodes():

@@ -1,0 +1,54 @@
+"""Where a student gets nowhere: it stands still, or comes back again and again to where it was."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Visits of the same state in an episode that make a stall.
+VISITS = 3
+_NEAR = 0.05  # in standard deviations: inputs that differ by no more, all of them, are those of the same state
+_EQUAL = 5e-4  # the same in the inputs' own units, as long as their deviations are not known
+
+
+class Stalls:
+    """Counts how often each of some environments has been in its present state in this episode.
+
+    States are the same if the environment's ``state`` is; where it has none, if no input differs by more than a
+    twentieth of its standard deviation. What moves along a cycle and drifts a little is found so, too.
+
+    :param n_envs: number of environments
+    """
+
+    def __init__(self, n_envs: int) -> None:
+        #: Standard deviations of the inputs, ``(n_inputs,)``; ``None`` as long as they are not known, when only inputs
+        #: that are equal to three digits are the same.
+        self.deviations: NDArray[np.floating] | None = None
+        self._states: list[dict[str, int]] = [{} for _ in range(n_envs)]
+        self._past: list[list[NDArray[np.float32]]] = [[] for _ in range(n_envs)]
+
+    def forget(self, row: int) -> None:
+        """Begin an episode."""
+        self._states[row], self._past[row] = {}, []
+
+    def visits(self, envs: Sequence[Any], inputs: NDArray[np.float32]) -> NDArray[np.intp]:
+        """Take in the present states; return how often each was visited, this time included, ``(n_envs,)``.
+
+        :param envs: the environments
+        :param inputs: what a student reads, ``(n_envs, n_inputs)``
+        """
+        return np.array([self._count(row, env, now) for row, (env, now) in enumerate(zip(envs, inputs, strict=True))])
+
+    def _count(self, row: int, env: Any, now: NDArray[np.float32]) -> int:
+        state = getattr(env.unwrapped, "state", None)
+        if isinstance(state, Mapping):
+            key, seen = repr(state), self._states[row]
+            seen[key] = seen.get(key, 0) + 1
+            return seen[key]
+        past = self._past[row]
+        past.append(now.copy())
+        near = _EQUAL if self.deviations is None else _NEAR * self.deviations
+        return int((np.abs(np.array(past) - now) <= near).all(axis=1).sum())
