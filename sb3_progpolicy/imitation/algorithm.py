@@ -311,7 +311,7 @@ class _Run:
         if number < n_before_sparse:
             selection.make_plain(fresh=(number - N_ROUNDS) % 2 == 1)
             last = number == n_before_sparse - 1
-            if last or (number >= N_ROUNDS + _FEWEST_PLAIN_ROUNDS - 1 and selection.plain_is_promising):
+            if last or (number >= N_ROUNDS + _FEWEST_PLAIN_ROUNDS - 1 and selection.plain_is_done):
                 selection.choose_plain()
             if last and not selection.is_plain:
                 selection.make_sparse()

@@ -88,9 +88,9 @@ class Selection:
             self.plain = sorted([*plain, *self.plain], key=lambda one: one[0], reverse=True)[:_FINALISTS]
 
     @property
-    def plain_is_promising(self) -> bool:
-        """Whether the episodes of a plain list are as good as the best list's."""
-        return self.best is not None and bool(self.plain) and self.judge.as_good(self.plain[0][0], self.best[0])
+    def plain_is_done(self) -> bool:
+        """Whether the episodes of a plain list are as good as the teacher's."""
+        return bool(self.plain) and self.judge.as_good(self.plain[0][0], self.judge.teacher_score)
 
     def choose_plain(self) -> None:
         """Go on with the smallest of the best plain lists if its episodes are as good as the best list's.
