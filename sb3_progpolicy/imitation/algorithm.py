@@ -29,7 +29,7 @@ from sb3_progpolicy.spaces import action_spec
 #: Share of the teacher in each round; 0 in all later ones.
 TEACHER_SHARES = (1.0, 0.6, 0.4, 0.3, 0.2, 0.1)
 N_ROUNDS, N_PLAIN_ROUNDS, N_SPARSE_ROUNDS = 9, 10, 3
-_FEWEST_PLAIN_ROUNDS = 3  # before a plain list is taken
+_FEWEST_PLAIN_ROUNDS = 6  # before a plain list is taken
 _CHANGED = 0.02  # share of the actions, or mean distance, that rounding may change
 _DIGITS = (2, 3, 4, 6)
 #: Inputs that are not read by default: beyond the training sizes they take values that were never seen.

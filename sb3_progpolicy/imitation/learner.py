@@ -20,7 +20,7 @@ _REFIT_EVERY = 3  # rounds
 _COMPETES = 1.3  # a list whose loss is so many times the least has its episodes looked at, too
 _RESTARTS = 3  # of the fit by planes
 _EXPLAINED = 0.7  # share of the states that pieces have to explain, or the teacher is not made of them
-_STALLED = 60.0  # weight of a state in which a student stands still, for plain lists: one of them loses the episode
+_LOSES = 60.0  # weight of a state in which a student loses an episode, or gets nowhere, for plain lists
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ class Learner:
         if not isinstance(self.loss, BoxLoss):
             return []
         scaler, data = self._prepared()
-        data = replace(data, weights=np.where(self.weights > 1, _STALLED, self.weights))
+        data = replace(data, weights=np.where(self.weights > 1, _LOSES, self.weights))
         loss = PieceLoss(self.loss.bounded, self.loss.direction)
         finder = PieceFinder(loss, data, self.rng)
         known = None if self.plain_raw is None else self._scaled(self.plain_raw, scaler)

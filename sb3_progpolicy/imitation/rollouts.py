@@ -21,7 +21,9 @@ from sb3_progpolicy.spaces import action_spec, check_observation_space
 Act = Callable[[Observations], NDArray[Any]]
 Variations = Sequence[Mapping[str, Any]]
 _SEGMENT = (5, 40)  # steps for which teacher or student act in turn
-_RESCUE = 10  # steps of the teacher out of one
+_RESCUE = 10  # steps of the teacher out of a stall
+_LAST = 25  # steps before an episode is lost, of which some may have lost it
+_WRONG = 0.25  # share of half the range of an action that it differs by from the teacher's, and more
 STALL_WEIGHT = 3.0
 _STEPS_COUNT = 0.1  # a tenth more steps than the teacher's are as bad as one failure in a hundred
 _NOISE = 0.15  # of the first round, in which only the teacher acts
@@ -221,8 +223,8 @@ class Visits:
 
     :param inputs: what a student reads, ``(n, n_inputs)``
     :param actions: the teacher's, ``(n, *action_shape)``
-    :param weights: ``(n,)``; more where the student stands still
-    :param n_stalls: how often it stood still
+    :param weights: ``(n,)``; more where the student gets nowhere or loses an episode
+    :param n_stalls: how often it got nowhere
     :param ended: success and steps of the episodes that ended
     :param good: all actions that are as good as the teacher's, ``(n, n_actions)``; ``None`` if that is not known
     """
@@ -240,7 +242,8 @@ class Collector:
 
     Larger variations are drawn more often, since their ends are states of the smaller ones: each size twice as often as
     the one before. In an environment with a goal, a student that comes to the same state for the third time in an
-    episode stands still: its states weigh more, and the teacher takes over for some steps.
+    episode gets nowhere: its states weigh more, and the teacher takes over for some steps. So do those in which it did
+    otherwise than the teacher in the last steps of an episode that ended without success.
 
     :param pool: the environments
     :param teacher: labels every state
@@ -289,10 +292,11 @@ class Collector:
         """
         pool, rng = self.pool, self.rng
         visits = Visits(np.zeros(0, np.float32), np.zeros(0), np.zeros(0))
-        inputs, labels, weights = [], [], []
+        inputs, labels, weights, wrong = [], [], [], []
+        first = np.zeros(len(pool), dtype=np.int64)  # step at which the present episode began
         states: list[Mapping[str, Any]] = []
         knows_all = isinstance(self.teacher, PlannerTeacher) and self.teacher.knows_all
-        for _ in range(n_steps):
+        for step in range(n_steps):
             stalled = self._stalled()
             visits.n_stalls += int(stalled.sum())
             label = self.teacher.label(pool.situation())
@@ -309,12 +313,18 @@ class Collector:
             actions = np.where(self._guided.reshape(-1, *[1] * (label.ndim - 1)), label, actions)
             if student is None:
                 actions = self._disturbed(actions)
+            wrong.append(self._differ(actions, label))
             pool.actions = actions
             for row in range(len(pool)):
                 ended, info = pool.step(row, actions[row])
                 self._elapsed[row] += 1
                 self._has_goal = self._has_goal or "is_success" in info
                 if ended or self._elapsed[row] >= self.limit:
+                    if ended and student is not None and not info.get("is_success", True):
+                        for earlier in range(max(first[row], step + 1 - _LAST), step + 1):
+                            if wrong[earlier][row]:
+                                weights[earlier][row] = STALL_WEIGHT
+                    first[row] = step + 1
                     visits.ended.append((bool(info.get("is_success", False)), int(self._elapsed[row])))
                     self._reset(row)
         visits.inputs, visits.actions = np.concatenate(inputs), np.concatenate(labels)
@@ -343,12 +353,25 @@ class Collector:
             return np.zeros(len(self.pool), dtype=bool)
         return self.stalls.visits(self.pool.envs, self.pool.inputs) >= VISITS
 
+    def _differ(self, actions: NDArray[Any], labels: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return which actions are others than the teacher's, ``(n_envs,)``."""
+        if np.issubdtype(actions.dtype, np.floating):
+            far = np.abs(actions - labels) > _WRONG * self._half_range
+        else:
+            far = actions != labels
+        return np.asarray(far.reshape(len(actions), -1).any(axis=1))
+
+    @property
+    def _half_range(self) -> NDArray[np.float64]:
+        """Half the range of each number of an action; 1 where it has no bounds."""
+        space: Any = self.pool.envs[0].action_space
+        return np.where(np.isfinite(space.high - space.low), (space.high - space.low) / 2, 1.0)
+
     def _disturbed(self, actions: NDArray[Any]) -> NDArray[Any]:
         """Return the teacher's actions with some noise, so that it is seen to correct itself."""
         space: Any = self.pool.envs[0].action_space
         if np.issubdtype(actions.dtype, np.floating):
-            span = np.where(np.isfinite(space.high - space.low), (space.high - space.low) / 2, 1.0)
-            noisy = actions + _NOISE * span * self.rng.normal(size=actions.shape)
+            noisy = actions + _NOISE * self._half_range * self.rng.normal(size=actions.shape)
             return np.clip(noisy, space.low, space.high).astype(actions.dtype)
         drawn = self.rng.integers(space.start, space.start + space.n, size=actions.shape)
         return np.where(self.rng.random(actions.shape) < _NOISE, drawn, actions)

@@ -321,3 +321,20 @@ def test_command_line_distills_a_planner(tmp_path, capsys, monkeypatch):
 def test_command_line_says_what_is_missing(capsys):
     assert run(["distill", "--from", "planner"]) == 2
     assert "needs --env" in capsys.readouterr().err
+
+
+def test_what_loses_an_episode_weighs_more():
+    pool = Pool("PandaPush-v0", 2)
+    collector = Collector(pool, make_teacher("planner", pool.envs[0]), [{"n_objects": 1}], [0], seed=0)
+    collector.begin()
+
+    def away(observations):
+        """Push the block off the table."""
+        toward = 20 * observations[:, 7:10]
+        near = np.abs(observations[:, 7:9]).max(axis=1) < 0.02
+        return np.column_stack([np.where(near, -1.0, toward[:, 0]), toward[:, 1:], -np.ones(len(near))]).clip(-1, 1)
+
+    collector.collect(2, None, share=1.0)
+    visits = collector.collect(150, away, share=0.0)
+    assert any(not success and steps < collector.limit for success, steps in visits.ended)
+    assert (visits.weights > 1).sum() > visits.n_stalls
