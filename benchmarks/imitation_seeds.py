@@ -222,14 +222,28 @@ def main() -> None:
     wanted = wanted_variations(options.env, options.final, options.sizes)
     known = known_rows(name, arguments, options.episodes, wanted)
     rows: list[dict[str, Any]] = []
-    for seed in track(["teacher", *map(str, range(options.seeds))], "Seeds"):
+    seeds = ["teacher", *map(str, range(options.seeds))]
+    for seed in track(seeds, "Seeds"):
         if seed not in known:
             program = None if seed == "teacher" else learn(teacher, options.env, int(seed), folder, arguments)
             known[seed] = rows_of(seed, options.env, teacher, program, options.episodes, wanted)
-        rows += known[seed]
+        rows = [row for one in seeds if one in known for row in known[one]]
         write_results(name, COLUMNS, rows, arguments)
     for variation in dict.fromkeys(row["variation"] for row in rows):
         print(_sentence(variation, [row for row in rows if row["variation"] == variation]))
+    print(f"median seed by what was reached in training: {median_seed(rows)}")
+
+
+def median_seed(rows: list[dict[str, Any]]) -> str:
+    """Return the seed in the middle by success on training variations, then by steps; the better of two."""
+
+    def reached(seed: str) -> tuple[float, float]:
+        own = [row for row in rows if str(row["seed"]) == seed and row["set"] == "train"]
+        successes = [row["return_mean"] if row["success_rate"] == "" else row["success_rate"] for row in own]
+        return float(np.mean(successes)), -float(np.mean([row["steps_mean"] for row in own]))
+
+    ranked = sorted(dict.fromkeys(str(row["seed"]) for row in rows if row["seed"] != "teacher"), key=reached)
+    return ranked[len(ranked) // 2]
 
 
 def _sentence(variation: str, rows: list[dict[str, Any]]) -> str:
