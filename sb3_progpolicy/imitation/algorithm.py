@@ -29,7 +29,6 @@ from sb3_progpolicy.spaces import action_spec
 #: Share of the teacher in each round; 0 in all later ones.
 TEACHER_SHARES = (1.0, 0.6, 0.4, 0.3, 0.2, 0.1)
 N_ROUNDS, N_PLAIN_ROUNDS, N_SPARSE_ROUNDS = 9, 10, 3
-_FEWEST_PLAIN_ROUNDS = 6  # before a plain list is taken
 _CHANGED = 0.02  # share of the actions, or mean distance, that rounding may change
 _DIGITS = (2, 3, 4, 6)
 #: Inputs that are not read by default: beyond the training sizes they take values that were never seen.
@@ -310,11 +309,10 @@ class _Run:
             selection.make_short()
         if number < n_before_sparse:
             selection.make_plain(fresh=(number - N_ROUNDS) % 2 == 1)
-            last = number == n_before_sparse - 1
-            if last or (number >= N_ROUNDS + _FEWEST_PLAIN_ROUNDS - 1 and selection.plain_is_done):
+            if number == n_before_sparse - 1:
                 selection.choose_plain()
-            if last and not selection.is_plain:
-                selection.make_sparse()
+                if not selection.is_plain:
+                    selection.make_sparse()
         else:
             selection.offer(learner.refit_sparse(), sparse=True)
         if selection.is_plain or number == self.n_rounds - 1:

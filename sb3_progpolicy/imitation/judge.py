@@ -29,11 +29,6 @@ class Judge:
         self.last_result: dict[str, float] = {}
 
     @property
-    def teacher_score(self) -> float:
-        """The teacher's score."""
-        return self.teacher_episodes.score(float(self.teacher_episodes.steps.mean()))
-
-    @property
     def limit(self) -> int:
         """Steps after which an episode is ended: what takes far longer than the teacher's has failed."""
         if not len(self.teacher_episodes.successes):

@@ -43,7 +43,6 @@ class Selection:
         self.plain: list[Scored] = []
         #: Whether a plain list was taken over.
         self.is_plain = False
-        self._merits: dict[bytes, float] = {}
 
     def offer(self, candidate: DecisionList, sparse: bool = False) -> None:
         """Keep a candidate if its episodes are better than the best so far.
@@ -87,11 +86,6 @@ class Selection:
             # Of equal ones the later: it has seen more.
             self.plain = sorted([*plain, *self.plain], key=lambda one: one[0], reverse=True)[:_FINALISTS]
 
-    @property
-    def plain_is_done(self) -> bool:
-        """Whether the episodes of a plain list are as good as the teacher's."""
-        return bool(self.plain) and self.judge.as_good(self.plain[0][0], self.judge.teacher_score)
-
     def choose_plain(self) -> None:
         """Go on with the smallest of the best plain lists if its episodes are as good as the best list's.
 
@@ -101,7 +95,7 @@ class Selection:
         if not self.plain:
             return
         dense, *merits = (self._merit(candidate) for _, candidate in (self.best, *self.plain))
-        as_good = [index for index, merit in enumerate(merits) if self.judge.as_good(merit, max(merits))]
+        as_good = [index for index, merit in enumerate(merits) if self.judge.as_good(merit, max(merits), share=0.5)]
         index = min(as_good, key=lambda one: _n_numbers(self.plain[one][1]))
         loss = self.learner.loss_of if self.augmented else lambda _: 0.0
         if self.judge.as_good(merits[index] - loss(self.plain[index][1]), dense - loss(self.best[1])):
@@ -146,14 +140,11 @@ class Selection:
 
     def _merit(self, candidate: DecisionList) -> float:
         """Return the score of many episodes, the mean of training and validation variations where there are these."""
-        key = candidate.conditions.tobytes() + candidate.controllers.tobytes()
-        if key not in self._merits:
-            act = self.codec.act_of(candidate)
-            scores = [self.judge.score_at_length(act)]
-            if self.beyond:
-                scores.append(self.judge.score_at_length(act, self.beyond))
-            self._merits[key] = float(np.mean(scores))
-        return self._merits[key]
+        act = self.codec.act_of(candidate)
+        scores = [self.judge.score_at_length(act)]
+        if self.beyond:
+            scores.append(self.judge.score_at_length(act, self.beyond))
+        return float(np.mean(scores))
 
     def _take_over(self, candidate: DecisionList) -> float | None:
         """Go on with a smaller list if its loss is not far from the best one's and its episodes are as good.
