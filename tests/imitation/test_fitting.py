@@ -164,3 +164,11 @@ def test_numbers_are_rounded_to_significant_digits(known):
     small = DecisionList(known.conditions, known.controllers + 0.004)
     assert (rounded(small, 2, unit).controllers[2, :, -1] == 0).all()
     assert (rounded(small, 2, unit).controllers[2, :, 1] == 0.004).all()
+
+
+def test_no_constant_of_a_condition_parts_equal_values():
+    inputs = np.column_stack([np.array([0.0, 0.0, 1.0, 1.0, 1.0, 1.0]), np.ones(6)])
+    gains = np.array([1.0, -3.0, 1.0, 1.0, 1.0, -1.0])
+    condition, gain = fit_condition(inputs, gains)
+    assert gain == pytest.approx(2.0)
+    assert gains[inputs @ condition >= 0].sum() == pytest.approx(gain)
