@@ -3,7 +3,7 @@
     python benchmarks/imitation_yardsticks.py --env PandaSlide-v0 --branches 8 [--episodes 100] [--final]
 
 The students are a decision tree with as many leaves as a program has branches, one of depth 8, and a network with two
-layers of 64 units, all from scikit-learn, in the same rounds of DAgger (without the weights of VIPER, Bastani et al.
+layers of 64 units, all from scikit-learn, in twelve rounds of DAgger (without the weights of VIPER, Bastani et al.
 2018, which need the teacher's values). Needs the extra ``sizes``.
 
 Writes ``benchmarks/results/<name>.csv`` and a ``.json`` with command, commit and versions.

@@ -82,11 +82,11 @@ class Ordering:
     def _with_one_more(self, order: Order) -> Order | None:
         """Return the order with the branch of the largest gain, whatever piece and position, if there is one."""
         rest, holds = self._rest(order), self._holds(order)
+        reached = [_none(holds[:, :position]) for position in range(len(order.pieces))]
         bounds = []  # of what each piece can gain at each position
         for position in range(len(order.pieces)):
-            reached = _none(holds[:, :position])
             gains = self.shares[:, None] * (rest[position][:, None] - self.losses)
-            most_gained = np.maximum(gains[reached], 0).sum(axis=0)
+            most_gained = np.maximum(gains[reached[position]], 0).sum(axis=0)
             bounds += [(float(bound), position, piece) for piece, bound in enumerate(most_gained)]
         bounds.sort(key=lambda one: -one[0])
         candidates: list[tuple[float, int, int, Floats]] = []
@@ -95,7 +95,7 @@ class Ordering:
             if bound < least:
                 break
             gains = self.shares * (rest[position] - self.losses[:, piece])
-            here = self._matters(gains, _none(holds[:, :position]))
+            here = self._matters(gains, reached[position])
             condition, gain = fit_condition(self.inputs[here], gains[here], ridges=(1e-3,), cautions=(1.0,))
             if condition is not None:
                 candidates.append((gain, position, piece, condition))
@@ -103,7 +103,7 @@ class Ordering:
         best, most = None, _WORTH
         for _, position, piece, condition in candidates[:_CLOSER]:
             gains = self.shares * (rest[position] - self.losses[:, piece])
-            here = self._matters(gains, _none(holds[:, :position]))
+            here = self._matters(gains, reached[position])
             fewer, gain = fit_priced_condition(self.inputs[here], gains[here], condition, PRICE)
             if fewer is not None and gain > most:
                 best, most = order.insert(position, fewer, piece), gain

@@ -22,7 +22,7 @@ Act = Callable[[Observations], NDArray[Any]]
 Variations = Sequence[Mapping[str, Any]]
 _SEGMENT = (5, 40)  # steps for which teacher or student act in turn
 _RESCUE = 10  # steps of the teacher out of a stall
-_LAST = 25  # steps before an episode is lost, of which some may have lost it
+_LAST_STEPS = 25  # steps before an episode is lost, of which some may have lost it
 _WRONG = 0.25  # share of half the range of an action that it differs by from the teacher's, and more
 STALL_WEIGHT = 3.0
 _STEPS_COUNT = 0.1  # a tenth more steps than the teacher's are as bad as one failure in a hundred
@@ -297,10 +297,11 @@ class Collector:
         states: list[Mapping[str, Any]] = []
         knows_all = isinstance(self.teacher, PlannerTeacher) and self.teacher.knows_all
         for step in range(n_steps):
-            stalled = self._stalled()
+            seen = pool.inputs
+            stalled = self._stalled(seen)
             visits.n_stalls += int(stalled.sum())
             label = self.teacher.label(pool.situation())
-            inputs.append(pool.inputs)
+            inputs.append(seen)
             labels.append(label)
             if knows_all:
                 states += [env.unwrapped.state for env in pool.envs]
@@ -309,7 +310,7 @@ class Collector:
                 self._left[row], self._guided[row] = rng.integers(*_SEGMENT), rng.random() < share
             self._guided[stalled], self._left[stalled] = True, _RESCUE
             self._left -= 1
-            actions = label if student is None else np.array(student(pool.inputs))
+            actions = label if student is None else np.array(student(seen))
             actions = np.where(self._guided.reshape(-1, *[1] * (label.ndim - 1)), label, actions)
             if student is None:
                 actions = self._disturbed(actions)
@@ -321,7 +322,7 @@ class Collector:
                 self._has_goal = self._has_goal or "is_success" in info
                 if ended or self._elapsed[row] >= self.limit:
                     if ended and student is not None and not info.get("is_success", True):
-                        for earlier in range(max(first[row], step + 1 - _LAST), step + 1):
+                        for earlier in range(max(first[row], step + 1 - _LAST_STEPS), step + 1):
                             if wrong[earlier][row]:
                                 weights[earlier][row] = STALL_WEIGHT
                     first[row] = step + 1
@@ -347,11 +348,11 @@ class Collector:
         self._elapsed[row] = self._left[row] = 0
         self.stalls.forget(row)
 
-    def _stalled(self) -> NDArray[np.bool_]:
+    def _stalled(self, inputs: Observations) -> NDArray[np.bool_]:
         """Return which environments are in a state for the third time, or a later one, in this episode."""
         if not self._has_goal:
             return np.zeros(len(self.pool), dtype=bool)
-        return self.stalls.visits(self.pool.envs, self.pool.inputs) >= VISITS
+        return self.stalls.visits(self.pool.envs, inputs) >= VISITS
 
     def _differ(self, actions: NDArray[Any], labels: NDArray[Any]) -> NDArray[np.bool_]:
         """Return which actions are others than the teacher's, ``(n_envs,)``."""
