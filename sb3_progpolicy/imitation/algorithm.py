@@ -29,6 +29,7 @@ from sb3_progpolicy.spaces import action_spec
 #: Share of the teacher in each round; 0 in all later ones.
 TEACHER_SHARES = (1.0, 0.6, 0.4, 0.3, 0.2, 0.1)
 N_ROUNDS, N_PLAIN_ROUNDS, N_SPARSE_ROUNDS = 9, 10, 3
+_PLAIN_TIMES = 3  # as many steps in rounds of plain lists as states that are labelled, those that say most
 _CHANGED = 0.02  # share of the actions, or mean distance, that rounding may change
 _DIGITS = (2, 3, 4, 6)
 #: Inputs that are not read by default: beyond the training sizes they take values that were never seen.
@@ -103,9 +104,9 @@ def imitate(
     :param n_episodes: of each validation, on training variations; the last ones have twice as many
     :param env_kwargs: constructor arguments of the environment
     :param augment: makes states that were not visited, which the teacher labels too: a function from observations and
-        a generator to observations, or ``"taller_towers"`` for PandaStack; ``"begun_towers"`` begins its episodes with
-        a tower of up to four blocks instead. What was learned so was shown more than the training variations; the
-        metadata say so
+        a generator to observations, or ``"taller_towers"`` for PandaStack; ``"begun_towers"`` begins half of its
+        episodes with a tower of one to four blocks instead. What was learned so was shown more than the training
+        variations; the metadata say so
     :param callback: is called after each round
     :param checkpoint: file in which the state is kept after each round; one that exists is gone on from
     :return: the program; its metadata say that it was learned by imitation, and of whom
@@ -238,6 +239,8 @@ class _Run:
                 summaries = self.judge.last_result, self.judge.teacher_episodes.summary()
                 callback(Imitation(done, total, n_labelled, *summaries, best))
 
+        self.judge.patience = None  # with a memory, the same observation again and again may be on the way
+
         def score(program: Program) -> float:
             return self.judge.score(ProgramAct(program, len(self.pool)))
 
@@ -265,8 +268,7 @@ class _Run:
             targets=learner.targets,
             weights=learner.weights,
             present=learner.raw,
-            plain=learner.plain_raw,
-            plain_scored=tuple(selection.plain),
+            plain=tuple(selection.plain),
             best=selection.best,
             runners_up=tuple(selection.runners_up),
             result=selection.result,
@@ -280,10 +282,10 @@ class _Run:
         collector.rng.bit_generator.state = state.generators["collector"]
         collector.next_seed = state.next_seed
         learner.observations, learner.targets, learner.weights = state.observations, state.targets, state.weights
-        learner.raw, learner.plain_raw = state.present, state.plain
+        learner.raw = state.present
         selection.best, selection.runners_up = state.best, list(state.runners_up)
         selection.result, selection.reference = state.result, state.reference
-        selection.plain = list(state.plain_scored)
+        selection.plain = list(state.plain)
         return state.number
 
     def _round(self, number: int, n_steps: int) -> None:
@@ -291,9 +293,12 @@ class _Run:
         self.collector.begin()
         share = TEACHER_SHARES[number] if number < len(TEACHER_SHARES) else 0.0
         if learner.n_states:
-            self.collector.stalls.deviations = learner.observations.std(axis=0)
+            self.collector.stalls.deviations = deviations = learner.observations.std(axis=0)
+            if self.judge.patience is not None:
+                self.judge.patience.stalls.deviations = deviations[: self.pool.observations.shape[1]]
         student = None if learner.raw is None else self.codec.act_of(learner.raw)
-        visits = self.collector.collect(n_steps * (1 if number else 2), student, share)
+        times = _PLAIN_TIMES if N_ROUNDS <= number < N_ROUNDS + self.n_plain_rounds else 1
+        visits = self.collector.collect(n_steps * (1 if number else 2), student, share, times)
         targets = self.codec.encode(visits.actions) if visits.good is None else visits.good.astype(np.float64)
         learner.add(visits.inputs, targets, visits.weights)
         selection, n_before_sparse = self.selection, N_ROUNDS + self.n_plain_rounds
@@ -308,7 +313,7 @@ class _Run:
             selection.choose_finally()
             selection.make_short()
         if number < n_before_sparse:
-            selection.make_plain(fresh=(number - N_ROUNDS) % 2 == 1)
+            selection.make_plain(number - N_ROUNDS + 2)
             if number == n_before_sparse - 1:
                 selection.choose_plain()
                 if not selection.is_plain:

@@ -69,7 +69,7 @@ _MOST_BEGUN = 4  # blocks; the gripper's first place is just above so many
 
 
 def begun_towers(env: Any, seed: int, variation: Mapping[str, Any]) -> Observations:
-    """Begin an episode of PandaStack with the blocks of a variation beside a tower of up to four others.
+    """Begin an episode of PandaStack: every second one with a tower of up to four other blocks beside a variation's.
 
     :param env: the environment
     :param seed: of the episode
@@ -78,7 +78,8 @@ def begun_towers(env: Any, seed: int, variation: Mapping[str, Any]) -> Observati
     """
     if not hasattr(env.unwrapped, "begin_tower"):
         raise ValueError("augment='begun_towers' is not accepted: only PandaStack has towers")
-    n_done = int(np.random.default_rng((seed, 1)).integers(_MOST_BEGUN + 1))
+    rng = np.random.default_rng((seed, 1))
+    n_done = 0 if rng.random() < 0.5 else int(rng.integers(1, _MOST_BEGUN + 1))
     env.reset(seed=seed, options={**variation, "n_objects": variation.get("n_objects", 1) + n_done})
     return np.asarray(env.unwrapped.begin_tower(n_done))
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from sb3_progpolicy.imitation.rollouts import Act, Pool, Variations, play
+from sb3_progpolicy.imitation.rollouts import Act, Episodes, Pool, Variations, play
+from sb3_progpolicy.imitation.stalls import Patience
 from sb3_progpolicy.imitation.teachers import Teacher
 
 #: Of the first episode; no episode of the training has a seed near it.
 VALIDATION_SEED = 50_000_000
-_HOPELESS = 6.0  # times the tolerance below what is needed
+_FEW_OF, _HOPELESS = 3, 14.0  # of so many episodes one comes first; times the tolerance that these may be below
 
 
 class Judge:
@@ -25,6 +26,10 @@ class Judge:
         self.teacher_episodes = play(pool, variations, n_episodes, VALIDATION_SEED, None, teacher)
         #: Whether episodes are those of the last validations, which nothing was chosen by before.
         self.final = False
+        #: What ends an episode that is lost; ``None`` if all run to their end.
+        self.patience: Patience | None = Patience(len(pool), self.limit)
+        #: Number of a series of episodes of its own, 0 for the one that the best lists are compared by.
+        self.series = 0
         #: Means of the episodes played last.
         self.last_result: dict[str, float] = {}
 
@@ -36,21 +41,22 @@ class Judge:
         return min(self.pool.cap, int(2 * self.teacher_episodes.steps.max() + 50))
 
     def score(self, act: Act, needed: float | None = None) -> float:
-        """Return the score of episodes; in the last validations of half of them, if these are far from what is needed.
+        """Return the score of episodes; of the first few alone, if these are far from what is needed.
 
         :param act: the candidate
         :param needed: a score to compare with
         """
         steps, seed = float(self.teacher_episodes.steps.mean()), VALIDATION_SEED
-        if self.final:
-            seed += self.n_episodes
-        episodes = play(self.pool, self.variations, self.n_episodes, seed, act)
-        score = episodes.score(steps)
-        if self.final and (needed is None or self.as_good(score, needed, share=_HOPELESS)):
-            episodes = play(self.pool, self.variations, 2 * self.n_episodes, seed, act)
-            score = episodes.score(steps)
+        n_episodes, n_first = self.n_episodes, -(-self.n_episodes // _FEW_OF)
+        if self.series:
+            seed += (7 + self.series) * self.n_episodes
+        elif self.final:
+            seed, n_episodes = seed + self.n_episodes, 2 * self.n_episodes
+        episodes = self._play(act, self.variations, n_episodes if needed is None else n_first, seed)
+        if needed is not None and self.as_good(episodes.score(steps), needed, share=_HOPELESS):
+            episodes = episodes.and_then(self._play(act, self.variations, n_episodes - n_first, seed + n_first))
         self.last_result = episodes.summary()
-        return score
+        return episodes.score(steps)
 
     def score_at_length(self, act: Act, variations: Variations = ()) -> float:
         """Return the score of four times as many episodes, which nothing else is chosen by.
@@ -59,8 +65,14 @@ class Judge:
         :param variations: to play on instead of those of this judge; steps are in the same unit
         """
         seed, n_episodes = VALIDATION_SEED + 3 * self.n_episodes, 4 * self.n_episodes
-        played = play(self.pool, variations or self.variations, n_episodes, seed, act)
+        played = self._play(act, variations or self.variations, n_episodes, seed)
         return played.score(float(self.teacher_episodes.steps.mean()))
+
+    def _play(self, act: Act, variations: Variations, n_episodes: int, seed: int) -> Episodes:
+        if self.patience is not None:
+            # Other variations may take longer than those of which the teacher's steps are known.
+            self.patience.limit = self.limit if variations is self.variations else self.pool.cap
+        return play(self.pool, variations, n_episodes, seed, act, patience=self.patience)
 
     def as_good(self, reached: float, score: float, share: float = 1.0) -> bool:
         """Return whether a score is as good as another, within a share of the tolerance."""

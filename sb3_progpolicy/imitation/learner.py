@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +21,9 @@ _REFIT_EVERY = 3  # rounds
 _COMPETES = 1.3  # a list whose loss is so many times the least has its episodes looked at, too
 _RESTARTS = 3  # of the fit by planes
 _EXPLAINED = 0.7  # share of the states that pieces have to explain, or the teacher is not made of them
+_PRUNED = 3  # branches that are taken out of a plain list, so that others may come
 _LOSES = 60.0  # weight of a state in which a student loses an episode, or gets nowhere, for plain lists
+_LOSING_SHARE = 0.3  # of all weight that these states may have together: a bad list is in few others
 
 
 @dataclass(frozen=True)
@@ -56,8 +59,6 @@ class Learner:
         self.weights = np.zeros(0)
         #: The present list, on raw observations.
         self.raw: DecisionList | None = None
-        #: The last plain list, on raw observations.
-        self.plain_raw: DecisionList | None = None
 
     @property
     def n_states(self) -> int:
@@ -140,38 +141,53 @@ class Learner:
         scaler, data = self._prepared()
         return self._refitted(self._scaled(raw.without(index), scaler), data, scaler, self.settings.round_steps)
 
-    def plain(self, fresh: bool) -> list[DecisionList]:
+    def plain(self, known: Sequence[DecisionList], anew: bool) -> list[DecisionList]:
         """Return plain lists: pieces of what the teacher does, put in an order by conditions of few inputs.
 
-        :param fresh: whether to order the pieces from nothing, too
-        :return: the list and the same with all its numbers fitted at once, on raw observations; none if the teacher is
-            not made of such pieces
+        :param known: plain lists to go on with, on raw observations, the best first: that one as it is, and all without
+            some of their branches, in whose places others may come; if there are none, one is made from nothing
+        :param anew: whether pieces are looked for as if none was known, beside those of the best list
+        :return: on raw observations; none if the teacher is not made of such pieces
         """
         if not isinstance(self.loss, BoxLoss):
             return []
         scaler, data = self._prepared()
-        data = replace(data, weights=np.where(self.weights > 1, _LOSES, self.weights))
+        data = replace(data, weights=self._losing_weighted())
         loss = PieceLoss(self.loss.bounded, self.loss.direction)
         finder = PieceFinder(loss, data, self.rng)
-        known = None if self.plain_raw is None else self._scaled(self.plain_raw, scaler)
-        own = [] if known is None else list(np.unique(known.controllers, axis=0))
-        pieces = finder.find(own)
+        present = [self._scaled(one, scaler) for one in known]
+        own = [] if not present else list(np.unique(present[0].controllers, axis=0))
+        pieces = finder.find([] if anew else own)
+        if anew and own:
+            pieces = np.concatenate([pieces, own])
         if finder.explained(pieces) < _EXPLAINED:
             return []
         ordering = Ordering(data, loss.matrix(data, pieces), self.settings.max_branches)
         orders = []
-        if known is not None:
-            losses = np.abs(known.controllers[:, None] - pieces[None]).sum(axis=(2, 3))
-            orders.append(ordering.fit(Order(tuple(known.conditions), tuple(map(int, losses.argmin(axis=1))))))
-        if known is None or fresh:
-            orders.append(ordering.fit())
-        order = min(orders, key=ordering.cost)
+        for index, one in enumerate(present):
+            distances = np.abs(one.controllers[:, None] - pieces[None]).sum(axis=(2, 3))
+            order = Order(tuple(one.conditions), tuple(map(int, distances.argmin(axis=1))))
+            orders += [ordering.fit(order)] if index == 0 else []
+            orders.append(ordering.fit(self._pruned(order)))
+        orders = orders or [ordering.fit()]
         width = data.inputs.shape[1]
-        plain = DecisionList(np.array(order.conditions).reshape(-1, width), pieces[list(order.pieces)])
-        self.plain_raw = _raw(plain, scaler)
-        seed = int(self.rng.integers(2**31))
-        tuned = fine_tune(self.loss, plain, data, self.settings.final_steps // 2, seed, (0.1, 0.02), keep_zeros=True)
-        return [self.plain_raw, _raw(tuned, scaler)]
+        return [
+            _raw(DecisionList(np.array(order.conditions).reshape(-1, width), pieces[list(order.pieces)]), scaler)
+            for order in orders
+        ]
+
+    def _losing_weighted(self) -> Floats:
+        """Return weights: states in which a student loses count far more, but no more than a share of all."""
+        losing = self.weights > 1
+        others = float(self.weights[~losing].sum())
+        most = _LOSING_SHARE / (1 - _LOSING_SHARE) * others / max(int(losing.sum()), 1)
+        return np.where(losing, np.clip(most, 1.0, _LOSES), self.weights)
+
+    def _pruned(self, order: Order) -> Order:
+        """Return an order without some of its branches, drawn by chance."""
+        for _ in range(min(_PRUNED, len(order.conditions))):
+            order = order.without(int(self.rng.integers(len(order.pieces))))
+        return order
 
     def refit_sparse(self) -> DecisionList:
         """Fit the numbers of the present list that are not 0 to all states, and return it."""

@@ -64,8 +64,8 @@ class Ordering:
             longer = self._with_one_more(order)
             if longer is None:
                 break
-            order = self._swept(self._swept(longer))
-        return self._shortened(order)
+            order = self._swept(longer)
+        return self._shortened(self._swept(order))
 
     def cost(self, order: Order) -> float:
         """Return the mean loss and the price of the inputs."""

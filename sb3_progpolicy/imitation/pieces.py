@@ -18,10 +18,12 @@ EXACT = 0.02  # loss of a piece in a state in which it is what the teacher does
 _WIDENING = (0.06, 0.03, EXACT, EXACT)  # losses up to which states belong to a piece that is being found
 _NEIGHBOURS, _STATES = 80, 2_500
 _INPUTS = (0, 1, 2, 3, 4)  # of an output
+_BEYOND = 2  # so many more inputs than pay are tried
 _PRICE = 0.002  # of an input, in the mean loss of its output
 _SHARE = 0.001  # of the states that each input of a piece has to be worth
 _FEWEST = 30  # states that a piece is fitted again to
 _TRIES = 16  # states that a piece is looked for from
+_NEW = 4  # pieces that are looked for beyond those that are known, or are one too many in the end
 _LEAST, _MOST = 0.003, 12  # share of the states that a piece adds; number of pieces
 _UNEXPLAINED = 0.01  # share of the states that are left over
 
@@ -97,13 +99,15 @@ class PieceLoss:
             weights = data.weights * np.maximum(self._free.reweighted(data, row, output, slack), 0.02)
             hessian = (data.inputs * weights[:, None]).T @ data.inputs / DELTA
             path = eliminate(hessian + 1e-5 * len(data) * np.eye(len(row)), row)
-            least = np.inf
+            least, most_paid = np.inf, 0
             for size in _INPUTS:
+                if size > most_paid + _BEYOND:
+                    break
                 support = next(kept for kept, _ in path if kept.sum() <= size + 1)
                 fitted = self._free.fit_support(data, output, support, slack)
                 price = self._free.of_output(data, fitted, output, slack) + _PRICE * size
                 if price < least:
-                    few[output], least = fitted, price
+                    few[output], least, most_paid = fitted, price, size
         return few
 
 
@@ -123,15 +127,16 @@ class PieceFinder:
     def find(self, known: Sequence[Floats] = ()) -> Floats:
         """Return pieces ``(n_pieces, n_outputs, n_inputs + 1)`` that explain nearly all states, each needed for some.
 
-        :param known: pieces to begin with
+        :param known: pieces to begin with; then at most four others are looked for, and each from half as many states
         """
         pieces, unexplained = [], np.ones(len(self.data), dtype=bool)
         for piece in known:
             pieces.append(self._widened(piece, _WIDENING[1:3]))
             unexplained &= ~self._exact(pieces[-1])
-        while len(pieces) < _MOST + 4 and unexplained.mean() >= _UNEXPLAINED:
+        limit, n_tries = (len(pieces) + _NEW, _TRIES) if pieces else (_MOST + _NEW, _TRIES)
+        while len(pieces) < limit and unexplained.mean() >= _UNEXPLAINED:
             best, most = None, _LEAST
-            for index, state in enumerate(self.rng.choice(np.flatnonzero(unexplained), _TRIES)):
+            for index, state in enumerate(self.rng.choice(np.flatnonzero(unexplained), n_tries)):
                 piece = self._around(int(state), trimmed=index % 2 == 1)
                 exact = self._exact(piece)
                 gain = float(self.shares[exact & unexplained].sum()) - _price(piece)
@@ -168,6 +173,7 @@ class PieceFinder:
         return self._widened(self.loss.fit_few(near, self.loss.fit(near), refit=False), _WIDENING)
 
     def _widened(self, piece: Floats, limits: Sequence[float]) -> Floats:
+        """Return the piece fitted to all states in which it is exact, or nearly so at first."""
         for limit in limits:
             rows = np.flatnonzero(self.loss.matrix(self.data, piece[None])[:, 0] < limit)
             if len(rows) < _FEWEST:

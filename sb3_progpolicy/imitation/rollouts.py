@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sb3_progpolicy.env_ids import spec_of
 from sb3_progpolicy.imitation.augmentation import Augment, Begin
-from sb3_progpolicy.imitation.stalls import VISITS, Stalls
+from sb3_progpolicy.imitation.stalls import VISITS, Patience, Stalls
 from sb3_progpolicy.imitation.teachers import Observations, PlannerTeacher, Situation, Teacher, join_history
 from sb3_progpolicy.programs.interpreter import ProgramRunner, Semantics
 from sb3_progpolicy.programs.syntax import ProgramData
@@ -127,6 +127,14 @@ class Episodes:
             return float(self.successes.mean() - _STEPS_COUNT * self.steps.mean() / max(steps, 1.0))
         return float(self.returns.mean())
 
+    def and_then(self, others: Episodes) -> Episodes:
+        """Return these episodes and others, without distances."""
+        return Episodes(
+            np.concatenate([self.returns, others.returns]),
+            np.concatenate([self.steps, others.steps]),
+            np.concatenate([self.successes, others.successes]),
+        )
+
     def summary(self) -> dict[str, float]:
         """Return the means by name."""
         means = {"return": float(self.returns.mean()), "steps": float(self.steps.mean())}
@@ -141,6 +149,7 @@ def play(
     act: Act | None,
     teacher: Teacher | None = None,
     distance: Callable[[NDArray[Any], NDArray[Any]], NDArray[np.float64]] | None = None,
+    patience: Patience | None = None,
 ) -> Episodes:
     """Play episodes, in turn on each variation.
 
@@ -151,6 +160,7 @@ def play(
     :param act: from observations to actions; ``None`` lets the teacher act
     :param teacher: who acts, or is asked what it would have done
     :param distance: of the actions from the teacher's, if it is to be measured
+    :param patience: ends episodes that it gives up, as failures; by default they run to their end
     """
     returns, steps = np.zeros(n_episodes), np.zeros(n_episodes, dtype=np.int64)
     successes: dict[int, bool] = {}
@@ -164,6 +174,8 @@ def play(
             act.begin()
         for row in rows:
             pool.reset(row, seed + first + row, variations[(first + row) % len(variations)])
+        if patience is not None:
+            patience.begin()
         live = list(rows)
         while live:
             labels = _labels(pool, teacher, live) if act is None or distance is not None else None
@@ -182,8 +194,17 @@ def play(
                     if "is_success" in info:
                         successes[episode] = bool(info["is_success"])
                         steps[episode] = steps[episode] if info["is_success"] else pool.cap
+                elif _gives_up(patience, pool, row, info, int(steps[episode])):
+                    live.remove(row)
+                    successes[episode], steps[episode] = False, pool.cap
     known = np.array([successes[key] for key in sorted(successes)], dtype=bool)
     return Episodes(returns, steps, known, float(np.concatenate(distances).mean()) if distances else float("nan"))
+
+
+def _gives_up(patience: Patience | None, pool: Pool, row: int, info: Mapping[str, Any], n_steps: int) -> bool:
+    if patience is None or "is_success" not in info:
+        return False
+    return patience.ends(row, pool.envs[row], pool.observations[row], n_steps)
 
 
 def _labels(pool: Pool, teacher: Teacher | None, live: Sequence[int]) -> NDArray[Any]:
@@ -236,6 +257,11 @@ class Visits:
     ended: list[tuple[bool, int]] = field(default_factory=list)
     good: NDArray[np.bool_] | None = None
 
+    def keep(self, rows: NDArray[np.intp]) -> None:
+        """Keep some of the states."""
+        self.inputs, self.actions, self.weights = self.inputs[rows], self.actions[rows], self.weights[rows]
+        self.good = None if self.good is None else self.good[rows]
+
 
 class Collector:
     """Environments in which teacher and student take turns (Ross et al. 2011).
@@ -283,12 +309,14 @@ class Collector:
         for row in range(len(self.pool)):
             self._reset(row)
 
-    def collect(self, n_steps: int, student: Act | None, share: float) -> Visits:
+    def collect(self, n_steps: int, student: Act | None, share: float, times: int = 1) -> Visits:
         """Visit states.
 
-        :param n_steps: of every environment
+        :param n_steps: of every environment whose states are returned
         :param student: from observations to actions; ``None`` while there is none
         :param share: of the turns that the teacher has
+        :param times: so many times as many steps are taken; of their states those come first that weigh more or in
+            which the student does otherwise than the teacher
         """
         pool, rng = self.pool, self.rng
         visits = Visits(np.zeros(0, np.float32), np.zeros(0), np.zeros(0))
@@ -296,7 +324,7 @@ class Collector:
         first = np.zeros(len(pool), dtype=np.int64)  # step at which the present episode began
         states: list[Mapping[str, Any]] = []
         knows_all = isinstance(self.teacher, PlannerTeacher) and self.teacher.knows_all
-        for step in range(n_steps):
+        for step in range(n_steps * times):
             seen = pool.inputs
             stalled = self._stalled(seen)
             visits.n_stalls += int(stalled.sum())
@@ -332,6 +360,9 @@ class Collector:
         visits.weights = np.concatenate(weights)
         if isinstance(self.teacher, PlannerTeacher) and knows_all:
             visits.good = self.teacher.good_actions(states)
+        if times > 1:
+            telling = np.concatenate(wrong) | (visits.weights > 1)
+            visits.keep(np.lexsort((rng.random(len(telling)), ~telling))[: len(telling) // times])
         if self.augment is not None:
             chosen = rng.random(len(visits.inputs)) < 0.5
             changed = self.augment(visits.inputs[chosen], rng)

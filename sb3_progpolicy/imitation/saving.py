@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,39 @@ from sb3_progpolicy.imitation.decision_list import DecisionList, Floats
 from sb3_progpolicy.programs.files import write_atomically
 
 Scored = tuple[float, DecisionList]
+_DOUBT = 0.05  # deviation of a score from the mean of many
+_PRICE = 3e-4  # of a number of a plain list, in its score
+
+
+@dataclass(frozen=True)
+class Plain:
+    """A plain list with its scores in series of episodes.
+
+    :param candidate: on raw observations
+    :param scores: of each series that it has played, the last one last
+    """
+
+    candidate: DecisionList
+    scores: tuple[float, ...]
+
+    @property
+    def last(self) -> float:
+        """The score in the last series."""
+        return self.scores[-1]
+
+    def and_then(self, score: float) -> Plain:
+        """Return the list with one more score."""
+        return replace(self, scores=(*self.scores, score))
+
+    def value(self) -> float:
+        """Return the mean score, less a deviation of it, and the price of the numbers."""
+        doubt = _DOUBT * max(1.0, abs(self.last)) / np.sqrt(len(self.scores))
+        return float(np.mean(self.scores) - doubt - _PRICE * n_numbers(self.candidate))
+
+
+def n_numbers(raw: DecisionList) -> int:
+    """Return how many numbers of a list are not 0."""
+    return int(np.count_nonzero(raw.conditions) + np.count_nonzero(raw.controllers))
 
 
 @dataclass(frozen=True)
@@ -28,8 +61,7 @@ class State:
     :param targets: their labels, ``(n, n_outputs)``
     :param weights: ``(n,)``
     :param present: the present list
-    :param plain: the last plain list
-    :param plain_scored: the best plain lists with their scores
+    :param plain: the best plain lists
     :param best: score and list; ``None`` before the first validation
     :param runners_up: the best few with their scores
     :param result: of the best list in its validation
@@ -43,8 +75,7 @@ class State:
     targets: Floats
     weights: Floats
     present: DecisionList | None
-    plain: DecisionList | None
-    plain_scored: tuple[Scored, ...]
+    plain: tuple[Plain, ...]
     best: Scored | None
     runners_up: tuple[Scored, ...]
     result: Mapping[str, float]
@@ -60,8 +91,9 @@ def save_state(path: Path, origin: Mapping[str, Any], state: State) -> None:
     """
     scored = [*([state.best] if state.best is not None else []), *state.runners_up]
     lists = {f"scored{index}": program for index, (_, program) in enumerate(scored)}
-    lists.update({f"plain{index}": program for index, (_, program) in enumerate(state.plain_scored)})
-    lists.update({name: own for name in ("present", "plain") if (own := getattr(state, name)) is not None})
+    lists.update({f"plain{index}": plain.candidate for index, plain in enumerate(state.plain)})
+    if state.present is not None:
+        lists["present"] = state.present
     arrays: dict[str, Any] = {
         f"{name}_{part}": getattr(program, part)
         for name, program in lists.items()
@@ -74,7 +106,7 @@ def save_state(path: Path, origin: Mapping[str, Any], state: State) -> None:
         "generators": state.generators,
         "has_best": state.best is not None,
         "scores": [score for score, _ in scored],
-        "plain_scores": [score for score, _ in state.plain_scored],
+        "plain_scores": [plain.scores for plain in state.plain],
         "result": dict(state.result),
         "reference": state.reference,
     }
@@ -111,8 +143,7 @@ def load_state(path: Path, origin: Mapping[str, Any]) -> State:
             targets=parts["targets"],
             weights=parts["weights"],
             present=_list(parts, "present") if "present_controllers" in parts else None,
-            plain=_list(parts, "plain") if "plain_controllers" in parts else None,
-            plain_scored=tuple((score, _list(parts, f"plain{i}")) for i, score in enumerate(about["plain_scores"])),
+            plain=tuple(Plain(_list(parts, f"plain{i}"), tuple(own)) for i, own in enumerate(about["plain_scores"])),
             best=scored[0] if about["has_best"] else None,
             runners_up=tuple(scored[int(about["has_best"]) :]),
             result=about["result"],

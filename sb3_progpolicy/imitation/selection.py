@@ -11,13 +11,14 @@ from sb3_progpolicy.imitation.decision_list import DecisionList
 from sb3_progpolicy.imitation.judge import Judge
 from sb3_progpolicy.imitation.learner import Learner
 from sb3_progpolicy.imitation.rollouts import Variations
-from sb3_progpolicy.imitation.saving import Scored
+from sb3_progpolicy.imitation.saving import Plain, Scored, n_numbers
 
 # Of the mean loss, and whether few inputs matter more; the sparsest program first.
 _TOLERANCES = ((0.012, True), (0.004, True), (0.003, False), (0.001, False))
 _FINALISTS = 3
 _RARE, _DROPS = 0.03, 5  # share of the states in which a rare branch acts; how many are tried without
 _NEAR, _LOSS = 1.3, 0.01  # a list whose loss is so many times the best one's, and more, is not looked at
+_AGAIN = 2  # of the best plain lists play new episodes in each round, and have lists made of them
 _SHORT = (7, 4, 2, 1)  # numbers of branches that are tried at the end
 
 
@@ -39,8 +40,8 @@ class Selection:
         #: Value of the best list of all, before it was made smaller: what smaller ones are held to.
         self.reference = -np.inf
         self.result: Mapping[str, float] = {}
-        #: The best plain lists with their scores.
-        self.plain: list[Scored] = []
+        #: The best plain lists.
+        self.plain: list[Plain] = []
         #: Whether a plain list was taken over.
         self.is_plain = False
 
@@ -74,17 +75,25 @@ class Selection:
             if self._take_over(self.learner.short(n_branches)) is not None:
                 return
 
-    def make_plain(self, fresh: bool) -> None:
+    def make_plain(self, series: int) -> None:
         """Keep the plain lists of the best episodes; the states of the next round are those that the best one visits.
 
-        :param fresh: whether to look for one from nothing, too
+        :param series: number of these episodes, which are others each time: what is best of many on the same ones would
+            soon be best there alone
         """
-        assert self.best is not None
-        plain = [(self.score(candidate, self.best[0]), candidate) for candidate in self.learner.plain(fresh)]
-        if plain:
-            self.learner.raw = max(plain, key=lambda one: one[0])[1]
-            # Of equal ones the later: it has seen more.
-            self.plain = sorted([*plain, *self.plain], key=lambda one: one[0], reverse=True)[:_FINALISTS]
+        candidates = self.learner.plain([plain.candidate for plain in self.plain[:_AGAIN]], anew=series % 2 == 0)
+        if not candidates:
+            return
+        self.judge.series = series
+        kept: list[Plain] = []
+        found: list[Plain] = []
+        for plain in [*self.plain[:_AGAIN], *(Plain(candidate, ()) for candidate in candidates)]:
+            best = max((one.last for one in (*kept, *found)), default=None)
+            (kept if plain.scores else found).append(plain.and_then(self.score(plain.candidate, best)))
+        self.judge.series = 0
+        # Of equal ones the later: it has seen more.
+        self.plain = sorted([*reversed(found), *kept, *self.plain[_AGAIN:]], key=Plain.value, reverse=True)[:_FINALISTS]
+        self.learner.raw = max([*found, *kept], key=Plain.value).candidate
 
     def choose_plain(self) -> None:
         """Go on with the smallest of the best plain lists if its episodes are as good as the best list's.
@@ -94,14 +103,15 @@ class Selection:
         assert self.best is not None
         if not self.plain:
             return
-        dense, *merits = (self._merit(candidate) for _, candidate in (self.best, *self.plain))
+        candidates = [plain.candidate for plain in self.plain]
+        dense, *merits = (self._merit(candidate) for candidate in (self.best[1], *candidates))
         as_good = [index for index, merit in enumerate(merits) if self.judge.as_good(merit, max(merits), share=0.5)]
-        index = min(as_good, key=lambda one: _n_numbers(self.plain[one][1]))
+        index = min(as_good, key=lambda one: n_numbers(candidates[one]))
         loss = self.learner.loss_of if self.augmented else lambda _: 0.0
-        if self.judge.as_good(merits[index] - loss(self.plain[index][1]), dense - loss(self.best[1])):
-            self.best, self.is_plain = self.plain[index], True
+        chosen = candidates[index]
+        if self.judge.as_good(merits[index] - loss(chosen), dense - loss(self.best[1])):
+            self.best, self.is_plain = (self.score(chosen), chosen), True
             self.learner.raw, self.reference = self.best[1], self.best[0]
-            self.score(self.best[1])
             self.result = self.judge.last_result
 
     def make_sparse(self) -> None:
@@ -165,8 +175,3 @@ class Selection:
         """Return the score less the loss where states were labelled that no episode comes to, else the score."""
         score, candidate = scored
         return score - self.learner.loss_of(candidate) if self.augmented else score
-
-
-def _n_numbers(raw: DecisionList) -> int:
-    """Return how many numbers of a list are not 0."""
-    return int(np.count_nonzero(raw.conditions) + np.count_nonzero(raw.controllers))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 #: Visits of the same state in an episode that make a stall.
 VISITS = 3
+_GIVEN_UP = 10  # visits of the same state after which nothing else is expected
 _NEAR = 0.05  # in standard deviations: inputs that differ by no more, all of them, are those of the same state
 _EQUAL = 5e-4  # the same in the inputs' own units, as long as their deviations are not known
 
@@ -34,15 +35,26 @@ class Stalls:
         """Begin an episode."""
         self._states[row], self._past[row] = {}, []
 
+    def forget_all(self) -> None:
+        """Begin episodes in all environments."""
+        for row in range(len(self._past)):
+            self.forget(row)
+
     def visits(self, envs: Sequence[Any], inputs: NDArray[np.float32]) -> NDArray[np.intp]:
         """Take in the present states; return how often each was visited, this time included, ``(n_envs,)``.
 
         :param envs: the environments
         :param inputs: what a student reads, ``(n_envs, n_inputs)``
         """
-        return np.array([self._count(row, env, now) for row, (env, now) in enumerate(zip(envs, inputs, strict=True))])
+        return np.array([self.visit(row, env, now) for row, (env, now) in enumerate(zip(envs, inputs, strict=True))])
 
-    def _count(self, row: int, env: Any, now: NDArray[np.float32]) -> int:
+    def visit(self, row: int, env: Any, now: NDArray[np.float32]) -> int:
+        """Take in the present state of one environment; return how often it was visited, this time included.
+
+        :param row: of the environment
+        :param env: the environment
+        :param now: what a student reads, ``(n_inputs,)``
+        """
         state = getattr(env.unwrapped, "state", None)
         if isinstance(state, Mapping):
             key, seen = repr(state), self._states[row]
@@ -52,3 +64,28 @@ class Stalls:
         past.append(now.copy())
         near = _EQUAL if self.deviations is None else _NEAR * self.deviations
         return int((np.abs(np.array(past) - now) <= near).all(axis=1).sum())
+
+
+class Patience:
+    """Gives up episodes with a goal that take far too long, or come back to the same state too often.
+
+    :param n_envs: number of environments
+    :param limit: steps after which an episode is given up
+    """
+
+    def __init__(self, n_envs: int, limit: int) -> None:
+        self.limit, self.stalls = limit, Stalls(n_envs)
+
+    def begin(self) -> None:
+        """Begin episodes in all environments."""
+        self.stalls.forget_all()
+
+    def ends(self, row: int, env: Any, now: NDArray[np.float32], n_steps: int) -> bool:
+        """Return whether an episode is given up in its present state.
+
+        :param row: of the environment
+        :param env: the environment
+        :param now: its observation
+        :param n_steps: taken so far
+        """
+        return n_steps >= self.limit or self.stalls.visit(row, env, now) > _GIVEN_UP

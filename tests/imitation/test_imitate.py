@@ -338,3 +338,23 @@ def test_what_loses_an_episode_weighs_more():
     visits = collector.collect(150, away, share=0.0)
     assert any(not success and steps < collector.limit for success, steps in visits.ended)
     assert (visits.weights > 1).sum() > visits.n_stalls
+
+
+def test_of_more_steps_those_states_come_first_that_say_most():
+    pool = Pool("PandaPush-v0", 2)
+    collector = Collector(pool, make_teacher("planner", pool.envs[0]), [{"n_objects": 1}], [0], seed=0)
+    collector.begin()
+    collector.collect(2, None, share=1.0)
+    wrong, turn = [], iter(range(1000))
+
+    def sometimes_wrong(observations):
+        labels = collector.teacher.label(pool.situation())
+        if next(turn) % 5:
+            return labels
+        wrong.extend(observations.copy())
+        return -labels
+
+    visits = collector.collect(20, sometimes_wrong, share=0.0, times=3)
+    assert len(visits.inputs) == len(visits.actions) == len(visits.weights) == 2 * 20
+    assert len(wrong) == 2 * 60 // 5
+    assert {row.tobytes() for row in wrong} < {row.tobytes() for row in visits.inputs}

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from sb3_progpolicy.analysis.rules import count_numbers
-from sb3_progpolicy.imitation import imitate
+from sb3_progpolicy.imitation import algorithm, imitate
+from sb3_progpolicy.imitation import judge as judge_module
 from sb3_progpolicy.imitation.actions import ActionCodec
 from sb3_progpolicy.imitation.algorithm import N_ROUNDS, _Run
 from sb3_progpolicy.imitation.conditions import fit_priced_condition
@@ -14,9 +15,9 @@ from sb3_progpolicy.imitation.learner import Learner, Settings
 from sb3_progpolicy.imitation.losses import BoxLoss
 from sb3_progpolicy.imitation.ordering import Order, Ordering
 from sb3_progpolicy.imitation.pieces import PieceFinder, PieceLoss
-from sb3_progpolicy.imitation.rollouts import Pool
+from sb3_progpolicy.imitation.rollouts import Pool, play
 from sb3_progpolicy.imitation.selection import Selection
-from sb3_progpolicy.imitation.tasks import validation_variations
+from sb3_progpolicy.imitation.tasks import names_of, validation_variations
 from sb3_progpolicy.imitation.teachers import make_teacher
 from sb3_progpolicy.spaces import ActionSpec
 
@@ -144,14 +145,24 @@ def test_learner_makes_a_plain_list_of_box_labels_alone():
     learner = Learner(codec, np.ones(N_INPUTS, dtype=bool), Settings(max_branches=6, seed=0))
     data = labelled()
     learner.add(data.inputs[:, :-1].astype(np.float32), data.targets, data.weights)
-    plain, tuned = learner.plain(fresh=True)
-    assert learner.plain_raw is plain
+    [plain] = learner.plain([], anew=False)
     assert 3 <= plain.n_branches <= 5
-    np.testing.assert_array_equal(plain.controllers[..., :-1] != 0, tuned.controllers[..., :-1] != 0)
-    assert learner.loss_of(tuned) <= learner.loss_of(plain) + 0.01 < 0.1
-    assert learner.plain(fresh=False)[0].n_branches == plain.n_branches
+    onward, pruned, other = learner.plain([plain, plain], anew=True)
+    assert onward.n_branches == plain.n_branches
+    assert max(learner.loss_of(one) for one in (onward, pruned, other)) < 0.1
     discrete = Learner(ActionCodec(ActionSpec("discrete", (3,)), ("a", "b", "c")), np.ones(4, bool), Settings(3, 0))
-    assert discrete.plain(fresh=True) == []
+    assert discrete.plain([], anew=False) == []
+
+
+@pytest.mark.parametrize(("n_losing", "weight"), [(2, 60.0), (100, 0.3 / 0.7 * 9), (990, 1.0)])
+def test_states_in_which_a_student_loses_have_a_share_of_the_weight_at_most(n_losing, weight):
+    learner = Learner(ActionCodec(ActionSpec("box", (1,), (-1.0,), (1.0,)), ("x",)), np.ones(2, bool), Settings(2, 0))
+    weights = np.ones(1000)
+    weights[:n_losing] = 3.0
+    learner.add(np.zeros((1000, 2), np.float32), np.zeros((1000, 1)), weights)
+    found = learner._losing_weighted()
+    np.testing.assert_allclose(found[:n_losing], weight)
+    np.testing.assert_array_equal(found[n_losing:], 1.0)
 
 
 def test_reaching_is_imitated_by_a_few_numbers_and_goes_on_after_an_interruption(monkeypatch, tmp_path):
@@ -162,6 +173,7 @@ def test_reaching_is_imitated_by_a_few_numbers_and_goes_on_after_an_interruption
         reset(self, row, seed, variation)
 
     monkeypatch.setattr(Pool, "reset", spy)
+    monkeypatch.setattr(algorithm, "N_PLAIN_ROUNDS", 4)
     arguments = {"n_timesteps": 4000, "n_episodes": 6, "max_conditions": 0, "n_envs": 6}
     whole = imitate("planner", "PandaReach-v0", **arguments)
     assert len(whole.conditions) == 0
@@ -184,12 +196,12 @@ def test_plain_list_is_taken_only_if_it_is_as_good_on_validation_variations(monk
     with Pool("PandaReach-v0", 4) as pool:
         codec = ActionCodec(pool.spec, ("move_x", "move_y", "move_z", "open"))
         judge = Judge(pool, [{"n_targets": 1}], 4, 0.015, make_teacher("planner", pool.envs[0]))
-    best, worse, plain = (DecisionList(np.zeros((0, 33)), np.full((1, 4, 33), value)) for value in (0.0, 1.0, 2.0))
+    best, worse, plain = (DecisionList(np.zeros((0, 33)), np.full((1, 4, 33), value)) for value in range(3))
 
     class Plain:
         raw = best
 
-        def plain(self, fresh):
+        def plain(self, known, anew):
             return [plain, worse]
 
     selection = Selection(Plain(), judge, validation_variations("PandaReach-v0"), codec, False)
@@ -203,14 +215,51 @@ def test_plain_list_is_taken_only_if_it_is_as_good_on_validation_variations(monk
         return beyond if len(asked) > 2 and variations else 1.0
 
     monkeypatch.setattr(judge, "score_at_length", at_length)
-    selection.make_plain(fresh=True)
+    selection.make_plain(1)
     assert selection.learner.raw is plain
-    assert [one for _, one in selection.plain] == [plain, worse]
+    assert [one.candidate for one in selection.plain] == [plain, worse]
     selection.choose_plain()
     assert asked == [None, {"n_targets": 4}] * 3
     assert selection.is_plain == (beyond == 1.0)
     assert selection.best[1] is (plain if beyond == 1.0 else best)
     assert selection.learner.raw is plain  # the states that it visits are those to learn from
+
+
+def test_next_plain_list_is_made_of_the_one_of_the_best_episodes_and_is_seen_to_be_far_worse_in_a_few(monkeypatch):
+    with Pool("PandaReach-v0", 4) as pool:
+        codec = ActionCodec(pool.spec, ("move_x", "move_y", "move_z", "open"))
+        judge = Judge(pool, [{"n_targets": 1}], 6, 0.015, make_teacher("planner", pool.envs[0]))
+    straight = np.zeros((1, 4, 33))
+    names = names_of(pool.envs[0], 4, False)[0]
+    straight[0, range(3), [names.index(f"target_d{axis}") for axis in "xyz"]] = 20.0
+    straight[0, 3, -1] = -1.0
+    good, idle = (DecisionList(np.zeros((0, 33)), factor * straight) for factor in (1.0, 0.0))
+    given = []
+
+    class Plain:
+        raw = None
+
+        def plain(self, known, anew):
+            given.append((known, anew))
+            return [good, idle]
+
+    played = []
+
+    def counted(*arguments, **more):
+        played.append(arguments[2])
+        return play(*arguments, **more)
+
+    monkeypatch.setattr(judge_module, "play", counted)
+    selection = Selection(Plain(), judge, (), codec, False)
+    with Pool("PandaReach-v0", 4) as judge.pool:
+        selection.make_plain(1)
+        selection.make_plain(2)
+    assert given == [([], False), ([good, idle], True)]
+    assert [len(plain.scores) for plain in selection.plain] == [2, 1, 2]
+    assert selection.learner.raw is good
+    assert played == [6, 2, 6, 2, 2, 4, 2]
+    assert judge.last_result["success"] == 0.0
+    assert judge.last_result["steps"] == judge.pool.cap
 
 
 def test_only_states_that_no_episode_comes_to_count_beside_the_episodes():

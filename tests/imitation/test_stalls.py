@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sb3_progpolicy.imitation.stalls import VISITS, Stalls
+from sb3_progpolicy.imitation.rollouts import Pool, play
+from sb3_progpolicy.imitation.stalls import VISITS, Patience, Stalls
 
 
 def counts(path, state=None):
@@ -51,3 +52,26 @@ def test_episodes_are_apart_and_only_equal_states_count_before_deviations_are_kn
     assert stalls.visits([env, env], inputs).tolist() == [1, 1]
     stalls.forget(0)
     assert stalls.visits([env, env], inputs + np.float32(way)).tolist() == [1, expected]
+
+
+@pytest.mark.parametrize(("way", "limit", "least", "most"), [(0.0, 1000, 11, 25), (1.0, 30, 30, 30)])
+def test_validation_gives_up_what_stands_still_or_takes_far_too_long(way, limit, least, most):
+    taken = []
+
+    def act(observations):
+        """Stand still, or go around."""
+        taken.append(len(observations))
+        moves = [way * np.sin(len(taken) / 7), way * np.cos(len(taken) / 7), 0.0, -1.0]
+        return np.tile(np.array(moves, dtype=np.float32), (len(observations), 1))
+
+    patience = Patience(2, limit)
+    patience.stalls.deviations = np.full(32, 0.4)
+    with Pool("PandaReach-v0", 2) as pool:
+        whole = play(pool, [{"n_targets": 3}], 2, 0, act)
+        assert len(taken) == pool.cap
+        taken.clear()
+        given_up = play(pool, [{"n_targets": 3}], 2, 0, act, patience=patience)
+    assert least <= len(taken) <= most
+    assert not whole.successes.any()
+    assert given_up.successes.tolist() == [False, False]
+    assert given_up.steps.tolist() == whole.steps.tolist() == [pool.cap, pool.cap]
