@@ -195,6 +195,10 @@ class ProcessLoops(_RemoteLoops):
         try:
             return list(self._pool.map(_run, jobs))
         except BrokenProcessPool as error:
+            # Python before 3.11.5 waits forever if a process died before it had read its job (CPython issue 94777).
+            queue: Any = getattr(self._pool, "_call_queue", None)
+            if queue is not None:
+                queue._reader.close()
             raise WorkerDiedError(
                 "a process that makes inner loops has died, perhaps for lack of memory, or because its model could "
                 "not be made; its error is above"

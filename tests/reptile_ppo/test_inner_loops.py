@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -14,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_progpolicy import ReptileCheckpoint, ReptilePPO, make_fast_vec_env
 from sb3_progpolicy.reptile_ppo import Theta
-from sb3_progpolicy.reptile_ppo.inner_loops import mean_of
+from sb3_progpolicy.reptile_ppo.inner_loops import ProcessLoops, mean_of
 from sb3_progpolicy.vec_env.worker import WorkerDiedError
 
 ROLLOUT = 4 * 16
@@ -172,6 +173,20 @@ def test_a_process_that_dies_is_named():
 
     with pytest.raises(WorkerDiedError, match="has died"):
         make(engine="local").learn(ROLLOUT * 90, callback=Kill())
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="stops a process")
+def test_a_process_that_dies_before_it_has_read_its_job_is_named_and_waited_for_no_longer():
+    loops = ProcessLoops(make(engine="local"), 1)
+    pid = loops._pool.submit(os.getpid).result()
+    os.kill(pid, signal.SIGSTOP)
+    threading.Timer(1.0, os.kill, (pid, signal.SIGKILL)).start()
+    with pytest.raises(WorkerDiedError, match="has died"):
+        loops._map([bytes(5_000_000)] * 2)  # far more than a pipe holds
+    closing = threading.Thread(target=loops.close, daemon=True)
+    closing.start()
+    closing.join(timeout=60)
+    assert not closing.is_alive()
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc"), reason="looks for processes in /proc")
