@@ -69,7 +69,7 @@ _MOST_BEGUN = 4  # blocks; the gripper's first place is just above so many
 
 
 def begun_towers(env: Any, seed: int, variation: Mapping[str, Any]) -> Observations:
-    """Begin an episode of PandaStack: every second one with a tower of up to four other blocks beside a variation's.
+    """Begin an episode of PandaStack, in half of the cases with a tower of one to four other blocks.
 
     :param env: the environment
     :param seed: of the episode

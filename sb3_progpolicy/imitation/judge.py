@@ -9,6 +9,7 @@ from sb3_progpolicy.imitation.teachers import Teacher
 #: Of the first episode; no episode of the training has a seed near it.
 VALIDATION_SEED = 50_000_000
 _FEW_OF, _HOPELESS = 3, 14.0  # of so many episodes one comes first; times the tolerance that these may be below
+_BEFORE_SERIES = 7  # times the number of episodes: those of all other scores
 
 
 class Judge:
@@ -28,8 +29,6 @@ class Judge:
         self.final = False
         #: What ends an episode that is lost; ``None`` if all run to their end.
         self.patience: Patience | None = Patience(len(pool), self.limit)
-        #: Number of a series of episodes of its own, 0 for the one that the best lists are compared by.
-        self.series = 0
         #: Means of the episodes played last.
         self.last_result: dict[str, float] = {}
 
@@ -40,16 +39,17 @@ class Judge:
             return self.pool.cap
         return min(self.pool.cap, int(2 * self.teacher_episodes.steps.max() + 50))
 
-    def score(self, act: Act, needed: float | None = None) -> float:
+    def score(self, act: Act, needed: float | None = None, series: int = 0) -> float:
         """Return the score of episodes; of the first few alone, if these are far from what is needed.
 
         :param act: the candidate
         :param needed: a score to compare with
+        :param series: number of a series of episodes of its own; 0 for those that the best lists are compared by
         """
         steps, seed = float(self.teacher_episodes.steps.mean()), VALIDATION_SEED
         n_episodes, n_first = self.n_episodes, -(-self.n_episodes // _FEW_OF)
-        if self.series:
-            seed += (7 + self.series) * self.n_episodes
+        if series:
+            seed += (_BEFORE_SERIES + series) * self.n_episodes
         elif self.final:
             seed, n_episodes = seed + self.n_episodes, 2 * self.n_episodes
         episodes = self._play(act, self.variations, n_episodes if needed is None else n_first, seed)

@@ -156,20 +156,19 @@ class Learner:
         loss = PieceLoss(self.loss.bounded, self.loss.direction)
         finder = PieceFinder(loss, data, self.rng)
         present = [self._scaled(one, scaler) for one in known]
-        own = [] if not present else list(np.unique(present[0].controllers, axis=0))
+        own = list(np.unique(present[0].controllers, axis=0)) if present else []
         pieces = finder.find([] if anew else own)
         if anew and own:
             pieces = np.concatenate([pieces, own])
         if finder.explained(pieces) < _EXPLAINED:
             return []
         ordering = Ordering(data, loss.matrix(data, pieces), self.settings.max_branches)
-        orders = []
-        for index, one in enumerate(present):
+        starts = []
+        for one in present:
             distances = np.abs(one.controllers[:, None] - pieces[None]).sum(axis=(2, 3))
-            order = Order(tuple(one.conditions), tuple(map(int, distances.argmin(axis=1))))
-            orders += [ordering.fit(order)] if index == 0 else []
-            orders.append(ordering.fit(self._pruned(order)))
-        orders = orders or [ordering.fit()]
+            starts.append(Order(tuple(one.conditions), tuple(map(int, distances.argmin(axis=1)))))
+        starts = [*starts[:1], *map(self._pruned, starts)]
+        orders = [ordering.fit(start) for start in starts] or [ordering.fit()]
         width = data.inputs.shape[1]
         return [
             _raw(DecisionList(np.array(order.conditions).reshape(-1, width), pieces[list(order.pieces)]), scaler)

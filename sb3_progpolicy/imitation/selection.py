@@ -84,13 +84,11 @@ class Selection:
         candidates = self.learner.plain([plain.candidate for plain in self.plain[:_AGAIN]], anew=series % 2 == 0)
         if not candidates:
             return
-        self.judge.series = series
         kept: list[Plain] = []
         found: list[Plain] = []
         for plain in [*self.plain[:_AGAIN], *(Plain(candidate, ()) for candidate in candidates)]:
             best = max((one.last for one in (*kept, *found)), default=None)
-            (kept if plain.scores else found).append(plain.and_then(self.score(plain.candidate, best)))
-        self.judge.series = 0
+            (kept if plain.scores else found).append(plain.and_then(self.score(plain.candidate, best, series)))
         # Of equal ones the later: it has seen more.
         self.plain = sorted([*reversed(found), *kept, *self.plain[_AGAIN:]], key=Plain.value, reverse=True)[:_FINALISTS]
         self.learner.raw = max([*found, *kept], key=Plain.value).candidate
@@ -144,9 +142,9 @@ class Selection:
             else:
                 return
 
-    def score(self, raw: DecisionList, needed: float | None = None) -> float:
+    def score(self, raw: DecisionList, needed: float | None = None, series: int = 0) -> float:
         """Return the score of a list's episodes; see :meth:`~sb3_progpolicy.imitation.judge.Judge.score`."""
-        return self.judge.score(self.codec.act_of(raw), needed)
+        return self.judge.score(self.codec.act_of(raw), needed, series)
 
     def _merit(self, candidate: DecisionList) -> float:
         """Return the score of many episodes, the mean of training and validation variations where there are these."""

@@ -207,7 +207,7 @@ def test_plain_list_is_taken_only_if_it_is_as_good_on_validation_variations(monk
     selection = Selection(Plain(), judge, validation_variations("PandaReach-v0"), codec, False)
     selection.best, selection.reference = (1.0, best), 1.0
     scores, asked = iter([0.9, 0.8]), []
-    monkeypatch.setattr(judge, "score", lambda act, needed=None: next(scores, 1.0))
+    monkeypatch.setattr(judge, "score", lambda act, needed=None, series=0: next(scores, 1.0))
     judge.last_result = {"success": 1.0}
 
     def at_length(act, variations=()):
