@@ -17,11 +17,12 @@ from sb3_progpolicy.imitation.judge import Judge
 from sb3_progpolicy.imitation.learner import Learner, Settings
 from sb3_progpolicy.imitation.memory import SHARES, MemoryRun, imitate_with_memory
 from sb3_progpolicy.imitation.recurrent import RECURRENT_CELLS
-from sb3_progpolicy.imitation.rollouts import Collector, Pool, ProgramAct, Variations
+from sb3_progpolicy.imitation.rollouts import Pool, ProgramAct, Variations
 from sb3_progpolicy.imitation.saving import State, load_state, save_state
 from sb3_progpolicy.imitation.selection import Selection
 from sb3_progpolicy.imitation.tasks import names_of, training_variations, validation_variations
 from sb3_progpolicy.imitation.teachers import Teacher, TeacherLike, make_teacher
+from sb3_progpolicy.imitation.visits import Collector
 from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.programs.syntax import Expression
 from sb3_progpolicy.spaces import action_spec
@@ -29,7 +30,6 @@ from sb3_progpolicy.spaces import action_spec
 #: Share of the teacher in each round; 0 in all later ones.
 TEACHER_SHARES = (1.0, 0.6, 0.4, 0.3, 0.2, 0.1)
 N_ROUNDS, N_PLAIN_ROUNDS, N_SPARSE_ROUNDS = 9, 10, 3
-_PLAIN_TIMES = 3  # as many steps in rounds of plain lists as states that are labelled, those that say most
 _CHANGED = 0.02  # share of the actions, or mean distance, that rounding may change
 _DIGITS = (2, 3, 4, 6)
 #: Inputs that are not read by default: beyond the training sizes they take values that were never seen.
@@ -172,7 +172,7 @@ class _Run:
         readable = np.array([name not in ignore for name in self.inputs])
         self.learner = Learner(self.codec, readable, Settings(max_branches, seed))
         beyond = validation_variations(env_id) if tasks is None else ()
-        self.selection = Selection(self.learner, self.judge, beyond, self.codec, self.augmentation is not None)
+        self.selection = Selection(self.learner, self.judge, beyond, self.codec, self.augmentation)
         self.n_labelled = 0
         #: Teachers with continuous actions may be made of pieces.
         self.n_plain_rounds = N_PLAIN_ROUNDS if self.spec.kind == "box" else 0
@@ -289,19 +289,15 @@ class _Run:
         return state.number
 
     def _round(self, number: int, n_steps: int) -> None:
-        learner = self.learner
-        self.collector.begin()
-        share = TEACHER_SHARES[number] if number < len(TEACHER_SHARES) else 0.0
+        learner, selection = self.learner, self.selection
+        n_before_sparse = N_ROUNDS + self.n_plain_rounds
         if learner.n_states:
             self.collector.stalls.deviations = deviations = learner.observations.std(axis=0)
             if self.judge.patience is not None:
                 self.judge.patience.stalls.deviations = deviations[: self.pool.observations.shape[1]]
-        student = None if learner.raw is None else self.codec.act_of(learner.raw)
-        times = _PLAIN_TIMES if N_ROUNDS <= number < N_ROUNDS + self.n_plain_rounds else 1
-        visits = self.collector.collect(n_steps * (1 if number else 2), student, share, times)
-        targets = self.codec.encode(visits.actions) if visits.good is None else visits.good.astype(np.float64)
-        learner.add(visits.inputs, targets, visits.weights)
-        selection, n_before_sparse = self.selection, N_ROUNDS + self.n_plain_rounds
+        # Plain lists learn from the episodes that they were judged by.
+        if number >= n_before_sparse or not selection.plain:
+            self._visit(number, n_steps)
         if number < N_ROUNDS - 1:
             for candidate in learner.fit(number):
                 if number >= N_ROUNDS // 2 - 1:
@@ -311,17 +307,31 @@ class _Run:
             for candidate in learner.finish():
                 selection.offer(candidate)
             selection.choose_finally()
-            selection.make_short()
         if number < n_before_sparse:
-            selection.make_plain(number - N_ROUNDS + 2)
-            if number == n_before_sparse - 1:
+            is_last = number == n_before_sparse - 1
+            selection.make_plain(number - N_ROUNDS + 2, 0 if is_last else n_steps * len(self.collector.pool))
+            if is_last:
                 selection.choose_plain()
                 if not selection.is_plain:
+                    selection.make_short()
                     selection.make_sparse()
         else:
             selection.offer(learner.refit_sparse(), sparse=True)
         if selection.is_plain or number == self.n_rounds - 1:
             selection.drop_rare_branches()
+
+    def _visit(self, number: int, n_steps: int) -> None:
+        """Label states that teacher and student visit in turns.
+
+        :param number: of the round
+        :param n_steps: of each environment
+        """
+        self.collector.begin()
+        share = TEACHER_SHARES[number] if number < len(TEACHER_SHARES) else 0.0
+        student = None if self.learner.raw is None else self.codec.act_of(self.learner.raw)
+        visits = self.collector.collect(n_steps * (1 if number else 2), student, share)
+        targets = self.codec.encode(visits.actions) if visits.good is None else visits.good.astype(np.float64)
+        self.learner.add(visits.inputs, targets, visits.weights)
 
     def _rounded(self) -> DecisionList:
         """Return the best list with as few digits as its episodes allow, its outputs in the unit of actions."""

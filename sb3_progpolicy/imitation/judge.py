@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sb3_progpolicy.imitation.rollouts import Act, Episodes, Pool, Variations, play
+from sb3_progpolicy.imitation.rollouts import Act, Episodes, Pool, Variations, Watcher, play
 from sb3_progpolicy.imitation.stalls import Patience
 from sb3_progpolicy.imitation.teachers import Teacher
 
@@ -24,6 +24,7 @@ class Judge:
 
     def __init__(self, pool: Pool, variations: Variations, n_episodes: int, tolerance: float, teacher: Teacher) -> None:
         self.pool, self.variations, self.n_episodes, self.tolerance = pool, variations, n_episodes, tolerance
+        self.teacher = teacher
         self.teacher_episodes = play(pool, variations, n_episodes, VALIDATION_SEED, None, teacher)
         #: Whether episodes are those of the last validations, which nothing was chosen by before.
         self.final = False
@@ -39,40 +40,58 @@ class Judge:
             return self.pool.cap
         return min(self.pool.cap, int(2 * self.teacher_episodes.steps.max() + 50))
 
-    def score(self, act: Act, needed: float | None = None, series: int = 0) -> float:
+    def score(self, act: Act, needed: float | None = None, series: int = 0, watcher: Watcher | None = None) -> float:
         """Return the score of episodes; of the first few alone, if these are far from what is needed.
 
         :param act: the candidate
         :param needed: a score to compare with
         :param series: number of a series of episodes of its own; 0 for those that the best lists are compared by
+        :param watcher: sees the episodes, with what the teacher would have done
         """
-        steps, seed = float(self.teacher_episodes.steps.mean()), VALIDATION_SEED
-        n_episodes, n_first = self.n_episodes, -(-self.n_episodes // _FEW_OF)
+        seed, n_episodes = VALIDATION_SEED, self.n_episodes
         if series:
             seed += (_BEFORE_SERIES + series) * self.n_episodes
         elif self.final:
             seed, n_episodes = seed + self.n_episodes, 2 * self.n_episodes
-        episodes = self._play(act, self.variations, n_episodes if needed is None else n_first, seed)
-        if needed is not None and self.as_good(episodes.score(steps), needed, share=_HOPELESS):
-            episodes = episodes.and_then(self._play(act, self.variations, n_episodes - n_first, seed + n_first))
-        self.last_result = episodes.summary()
-        return episodes.score(steps)
+        score, self.last_result = self._staged(act, self.variations, n_episodes, seed, needed, watcher)
+        return score
 
-    def score_at_length(self, act: Act, variations: Variations = ()) -> float:
-        """Return the score of four times as many episodes, which nothing else is chosen by.
+    def _staged(
+        self,
+        act: Act,
+        variations: Variations,
+        n_episodes: int,
+        seed: int,
+        needed: float | None,
+        watcher: Watcher | None = None,
+    ) -> tuple[float, dict[str, float]]:
+        """Return score and means of episodes, of a third of them if these are far below what is needed."""
+        steps = float(self.teacher_episodes.steps.mean())
+        n_first = n_episodes if needed is None else -(-n_episodes // _FEW_OF)
+        episodes = self._play(act, variations, n_first, seed, watcher)
+        if needed is not None and self.as_good(episodes.score(steps), needed, share=_HOPELESS):
+            rest = self._play(act, variations, n_episodes - n_first, seed + n_first, watcher)
+            episodes = episodes.and_then(rest)
+        return episodes.score(steps), episodes.summary()
+
+    def score_at_length(self, act: Act, variations: Variations = (), needed: float | None = None) -> float:
+        """Return the score of twice as many episodes, which nothing else is chosen by.
 
         :param act: the candidate
         :param variations: to play on instead of those of this judge; steps are in the same unit
+        :param needed: a score to compare with; see :meth:`score`
         """
-        seed, n_episodes = VALIDATION_SEED + 3 * self.n_episodes, 4 * self.n_episodes
-        played = self._play(act, variations or self.variations, n_episodes, seed)
-        return played.score(float(self.teacher_episodes.steps.mean()))
+        seed, n_episodes = VALIDATION_SEED + 3 * self.n_episodes, 2 * self.n_episodes
+        return self._staged(act, variations or self.variations, n_episodes, seed, needed)[0]
 
-    def _play(self, act: Act, variations: Variations, n_episodes: int, seed: int) -> Episodes:
+    def _play(
+        self, act: Act, variations: Variations, n_episodes: int, seed: int, watcher: Watcher | None = None
+    ) -> Episodes:
         if self.patience is not None:
             # Other variations may take longer than those of which the teacher's steps are known.
             self.patience.limit = self.limit if variations is self.variations else self.pool.cap
-        return play(self.pool, variations, n_episodes, seed, act, patience=self.patience)
+        teacher = None if watcher is None else self.teacher
+        return play(self.pool, variations, n_episodes, seed, act, teacher, patience=self.patience, watcher=watcher)
 
     def as_good(self, reached: float, score: float, share: float = 1.0) -> bool:
         """Return whether a score is as good as another, within a share of the tolerance."""

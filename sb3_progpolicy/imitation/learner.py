@@ -19,6 +19,7 @@ from sb3_progpolicy.imitation.tuning import fine_tune
 _FEW, _MANY = 6_000, 15_000  # states for a fit from nothing, and for one that only improves
 _REFIT_EVERY = 3  # rounds
 _COMPETES = 1.3  # a list whose loss is so many times the least has its episodes looked at, too
+_ORDERED = 10_000  # states that plain lists are fitted to
 _RESTARTS = 3  # of the fit by planes
 _EXPLAINED = 0.7  # share of the states that pieces have to explain, or the teacher is not made of them
 _PRUNED = 3  # branches that are taken out of a plain list, so that others may come
@@ -152,7 +153,7 @@ class Learner:
         if not isinstance(self.loss, BoxLoss):
             return []
         scaler, data = self._prepared()
-        data = replace(data, weights=self._losing_weighted())
+        data = _drawn(replace(data, weights=self._losing_weighted()), _ORDERED, self.rng)
         loss = PieceLoss(self.loss.bounded, self.loss.direction)
         finder = PieceFinder(loss, data, self.rng)
         present = [self._scaled(one, scaler) for one in known]
@@ -243,3 +244,17 @@ class Learner:
 
 def _raw(program: DecisionList, scaler: Scaler) -> DecisionList:
     return DecisionList(scaler.to_raw(program.conditions), scaler.to_raw(program.controllers))
+
+
+def _drawn(data: Data, size: int, rng: np.random.Generator) -> Data:
+    """Return about so many states, each with a chance that grows with its weight, and the same sums on average."""
+    if len(data) <= size:
+        return data
+    chances = np.zeros(len(data))
+    for _ in range(5):  # those that are sure leave more for the others
+        sure = chances >= 1
+        left = max(size - int(sure.sum()), 1)
+        chances = np.where(sure, 1.0, np.minimum(data.weights / data.weights[~sure].sum() * left, 1.0))
+    chosen = np.flatnonzero(rng.random(len(data)) < chances)
+    few = data.take(chosen)
+    return replace(few, weights=few.weights / chances[chosen])

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from sb3_progpolicy.imitation.actions import ActionCodec
 from sb3_progpolicy.imitation.recurrent import Sequences, fit_sequences, map_numbers, rounded_body
-from sb3_progpolicy.imitation.rollouts import Act, Collector, ProgramAct
+from sb3_progpolicy.imitation.rollouts import Act, ProgramAct
+from sb3_progpolicy.imitation.visits import Collector
 from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.programs.syntax import Expression
 

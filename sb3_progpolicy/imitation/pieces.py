@@ -22,7 +22,7 @@ _BEYOND = 2  # so many more inputs than pay are tried
 _PRICE = 0.002  # of an input, in the mean loss of its output
 _SHARE = 0.001  # of the states that each input of a piece has to be worth
 _FEWEST = 30  # states that a piece is fitted again to
-_TRIES = 16  # states that a piece is looked for from
+_TRIES, _PROMISING = 16, 4  # states that a piece is looked for from; how many are then fitted to all states
 _NEW = 4  # pieces that are looked for beyond those that are known, or are one too many in the end
 _LEAST, _MOST = 0.003, 12  # share of the states that a piece adds; number of pieces
 _UNEXPLAINED = 0.01  # share of the states that are left over
@@ -136,8 +136,11 @@ class PieceFinder:
         limit, n_tries = (len(pieces) + _NEW, _TRIES) if pieces else (_MOST + _NEW, _TRIES)
         while len(pieces) < limit and unexplained.mean() >= _UNEXPLAINED:
             best, most = None, _LEAST
-            for index, state in enumerate(self.rng.choice(np.flatnonzero(unexplained), n_tries)):
-                piece = self._around(int(state), trimmed=index % 2 == 1)
+            states = self.rng.choice(np.flatnonzero(unexplained), n_tries)
+            first = [self._around(int(state), trimmed=index % 2 == 1) for index, state in enumerate(states)]
+            nearly = self.loss.matrix(self.data, np.array(first))[unexplained] < _WIDENING[0]
+            for index in np.argsort(-(self.shares[unexplained] @ nearly))[:_PROMISING]:
+                piece = self._widened(first[index], _WIDENING)
                 exact = self._exact(piece)
                 gain = float(self.shares[exact & unexplained].sum()) - _price(piece)
                 if gain > most:
@@ -158,7 +161,7 @@ class PieceFinder:
         return np.asarray(self.loss.matrix(self.data, piece[None])[:, 0] < EXACT)
 
     def _around(self, state: int, trimmed: bool) -> Floats:
-        """Return the piece that explains a state and its neighbours, fitted to all states in which it is exact.
+        """Return the piece that explains a state and its neighbours.
 
         :param state: index
         :param trimmed: whether only the half of the neighbours that fits best is kept, since others may be of another
@@ -170,7 +173,7 @@ class PieceFinder:
         if trimmed:
             losses = self.loss.matrix(near, self.loss.fit(near)[None])[:, 0]
             near = near.take(losses <= np.median(losses))
-        return self._widened(self.loss.fit_few(near, self.loss.fit(near), refit=False), _WIDENING)
+        return self.loss.fit_few(near, self.loss.fit(near), refit=False)
 
     def _widened(self, piece: Floats, limits: Sequence[float]) -> Floats:
         """Return the piece fitted to all states in which it is exact, or nearly so at first."""

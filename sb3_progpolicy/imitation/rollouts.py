@@ -1,32 +1,26 @@
-"""States visited by teacher and student, and episodes to compare them by."""
+"""Environments, and episodes that are played in them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from sb3_progpolicy.env_ids import spec_of
-from sb3_progpolicy.imitation.augmentation import Augment, Begin
-from sb3_progpolicy.imitation.stalls import VISITS, Patience, Stalls
-from sb3_progpolicy.imitation.teachers import Observations, PlannerTeacher, Situation, Teacher, join_history
+from sb3_progpolicy.imitation.augmentation import Begin
+from sb3_progpolicy.imitation.stalls import Patience
+from sb3_progpolicy.imitation.teachers import Observations, Situation, Teacher, join_history
 from sb3_progpolicy.programs.interpreter import ProgramRunner, Semantics
 from sb3_progpolicy.programs.syntax import ProgramData
 from sb3_progpolicy.spaces import action_spec, check_observation_space
 
 Act = Callable[[Observations], NDArray[Any]]
 Variations = Sequence[Mapping[str, Any]]
-_SEGMENT = (5, 40)  # steps for which teacher or student act in turn
-_RESCUE = 10  # steps of the teacher out of a stall
-_LAST_STEPS = 25  # steps before an episode is lost, of which some may have lost it
-_WRONG = 0.25  # share of half the range of an action that it differs by from the teacher's, and more
-STALL_WEIGHT = 3.0
 _STEPS_COUNT = 0.1  # a tenth more steps than the teacher's are as bad as one failure in a hundred
-_NOISE = 0.15  # of the first round, in which only the teacher acts
 
 
 class Pool:
@@ -141,6 +135,22 @@ class Episodes:
         return {"success": float(self.successes.mean()), **means} if len(self.successes) else means
 
 
+class Watcher(Protocol):
+    """Sees the steps of episodes that are played."""
+
+    def see(self, rows: Sequence[int], inputs: Observations, actions: NDArray[Any], labels: NDArray[Any]) -> None:
+        """See a step.
+
+        :param rows: of the pool in which an episode goes on
+        :param inputs: what is acted on, of all rows
+        :param actions: what is done, of all rows
+        :param labels: what the teacher would have done, of all rows
+        """
+
+    def ended(self, row: int, success: bool) -> None:
+        """See the end of an episode."""
+
+
 def play(
     pool: Pool,
     variations: Variations,
@@ -150,6 +160,7 @@ def play(
     teacher: Teacher | None = None,
     distance: Callable[[NDArray[Any], NDArray[Any]], NDArray[np.float64]] | None = None,
     patience: Patience | None = None,
+    watcher: Watcher | None = None,
 ) -> Episodes:
     """Play episodes, in turn on each variation.
 
@@ -161,6 +172,7 @@ def play(
     :param teacher: who acts, or is asked what it would have done
     :param distance: of the actions from the teacher's, if it is to be measured
     :param patience: ends episodes that it gives up, as failures; by default they run to their end
+    :param watcher: sees each step with what the teacher would have done, which therefore has to be given
     """
     returns, steps = np.zeros(n_episodes), np.zeros(n_episodes, dtype=np.int64)
     successes: dict[int, bool] = {}
@@ -178,9 +190,13 @@ def play(
             patience.begin()
         live = list(rows)
         while live:
-            labels = _labels(pool, teacher, live) if act is None or distance is not None else None
-            actions = labels if act is None else act(pool.inputs)
+            asked = act is None or distance is not None or watcher is not None
+            labels = _labels(pool, teacher, live) if asked else None
+            inputs = pool.inputs
+            actions = labels if act is None else act(inputs)
             assert actions is not None
+            if watcher is not None and labels is not None:
+                watcher.see(live, inputs, actions, labels)
             if distance is not None and act is not None and labels is not None:
                 distances.append(distance(actions[live], labels[live]))
             pool.actions = actions
@@ -197,6 +213,10 @@ def play(
                 elif _gives_up(patience, pool, row, info, int(steps[episode])):
                     live.remove(row)
                     successes[episode], steps[episode] = False, pool.cap
+                else:
+                    continue
+                if watcher is not None:
+                    watcher.ended(row, successes.get(episode, True))
     known = np.array([successes[key] for key in sorted(successes)], dtype=bool)
     return Episodes(returns, steps, known, float(np.concatenate(distances).mean()) if distances else float("nan"))
 
@@ -236,174 +256,3 @@ class ProgramAct:
     def __call__(self, observations: Observations) -> NDArray[Any]:
         """Return actions ``(n_envs, *action_shape)``."""
         return self._runner.act(observations)
-
-
-@dataclass
-class Visits:
-    """States visited, with labels.
-
-    :param inputs: what a student reads, ``(n, n_inputs)``
-    :param actions: the teacher's, ``(n, *action_shape)``
-    :param weights: ``(n,)``; more where the student gets nowhere or loses an episode
-    :param n_stalls: how often it got nowhere
-    :param ended: success and steps of the episodes that ended
-    :param good: all actions that are as good as the teacher's, ``(n, n_actions)``; ``None`` if that is not known
-    """
-
-    inputs: NDArray[np.float32]
-    actions: NDArray[Any]
-    weights: NDArray[np.float64]
-    n_stalls: int = 0
-    ended: list[tuple[bool, int]] = field(default_factory=list)
-    good: NDArray[np.bool_] | None = None
-
-    def keep(self, rows: NDArray[np.intp]) -> None:
-        """Keep some of the states."""
-        self.inputs, self.actions, self.weights = self.inputs[rows], self.actions[rows], self.weights[rows]
-        self.good = None if self.good is None else self.good[rows]
-
-
-class Collector:
-    """Environments in which teacher and student take turns (Ross et al. 2011).
-
-    Larger variations are drawn more often, since their ends are states of the smaller ones: each size twice as often as
-    the one before. In an environment with a goal, a student that comes to the same state for the third time in an
-    episode gets nowhere: its states weigh more, and the teacher takes over for some steps. So do those in which it did
-    otherwise than the teacher in the last steps of an episode that ended without success.
-
-    :param pool: the environments
-    :param teacher: labels every state
-    :param variations: to draw from, the easiest first
-    :param ranks: size of each variation as a number from 0 on
-    :param seed: of the draws and of the episodes
-    :param augment: makes changed copies of half of the states, which are labelled too
-    :param limit: steps after which an episode is ended; by default the environment's own
-    """
-
-    def __init__(
-        self,
-        pool: Pool,
-        teacher: Teacher,
-        variations: Variations,
-        ranks: Sequence[int],
-        seed: int,
-        augment: Augment | None = None,
-        limit: int | None = None,
-    ) -> None:
-        self.augment = augment
-        self.pool, self.teacher, self.variations = pool, teacher, variations
-        chances = np.array([2.0 ** min(rank, 6) / ranks.count(rank) for rank in ranks])
-        self.chances = chances / chances.sum()
-        self.rng = np.random.default_rng(seed)
-        self.next_seed = 100_000 * (seed + 1)
-        self.limit = pool.cap if limit is None else limit
-        self._guided, self._left = np.zeros(len(pool), dtype=bool), np.zeros(len(pool), dtype=np.int64)
-        self._elapsed = np.zeros(len(pool), dtype=np.int64)
-        self.stalls = Stalls(len(pool))
-        self._has_goal = False
-
-    def begin(self) -> None:
-        """Begin episodes in all environments."""
-        self.teacher.begin()
-        self.pool.begin()
-        for row in range(len(self.pool)):
-            self._reset(row)
-
-    def collect(self, n_steps: int, student: Act | None, share: float, times: int = 1) -> Visits:
-        """Visit states.
-
-        :param n_steps: of every environment whose states are returned
-        :param student: from observations to actions; ``None`` while there is none
-        :param share: of the turns that the teacher has
-        :param times: so many times as many steps are taken; of their states those come first that weigh more or in
-            which the student does otherwise than the teacher
-        """
-        pool, rng = self.pool, self.rng
-        visits = Visits(np.zeros(0, np.float32), np.zeros(0), np.zeros(0))
-        inputs, labels, weights, wrong = [], [], [], []
-        first = np.zeros(len(pool), dtype=np.int64)  # step at which the present episode began
-        states: list[Mapping[str, Any]] = []
-        knows_all = isinstance(self.teacher, PlannerTeacher) and self.teacher.knows_all
-        for step in range(n_steps * times):
-            seen = pool.inputs
-            stalled = self._stalled(seen)
-            visits.n_stalls += int(stalled.sum())
-            label = self.teacher.label(pool.situation())
-            inputs.append(seen)
-            labels.append(label)
-            if knows_all:
-                states += [env.unwrapped.state for env in pool.envs]
-            weights.append(np.where(stalled, STALL_WEIGHT, 1.0))
-            for row in np.flatnonzero(self._left <= 0).tolist():
-                self._left[row], self._guided[row] = rng.integers(*_SEGMENT), rng.random() < share
-            self._guided[stalled], self._left[stalled] = True, _RESCUE
-            self._left -= 1
-            actions = label if student is None else np.array(student(seen))
-            actions = np.where(self._guided.reshape(-1, *[1] * (label.ndim - 1)), label, actions)
-            if student is None:
-                actions = self._disturbed(actions)
-            wrong.append(self._differ(actions, label))
-            pool.actions = actions
-            for row in range(len(pool)):
-                ended, info = pool.step(row, actions[row])
-                self._elapsed[row] += 1
-                self._has_goal = self._has_goal or "is_success" in info
-                if ended or self._elapsed[row] >= self.limit:
-                    if ended and student is not None and not info.get("is_success", True):
-                        for earlier in range(max(first[row], step + 1 - _LAST_STEPS), step + 1):
-                            if wrong[earlier][row]:
-                                weights[earlier][row] = STALL_WEIGHT
-                    first[row] = step + 1
-                    visits.ended.append((bool(info.get("is_success", False)), int(self._elapsed[row])))
-                    self._reset(row)
-        visits.inputs, visits.actions = np.concatenate(inputs), np.concatenate(labels)
-        visits.weights = np.concatenate(weights)
-        if isinstance(self.teacher, PlannerTeacher) and knows_all:
-            visits.good = self.teacher.good_actions(states)
-        if times > 1:
-            telling = np.concatenate(wrong) | (visits.weights > 1)
-            visits.keep(np.lexsort((rng.random(len(telling)), ~telling))[: len(telling) // times])
-        if self.augment is not None:
-            chosen = rng.random(len(visits.inputs)) < 0.5
-            changed = self.augment(visits.inputs[chosen], rng)
-            labels = [visits.actions, self.teacher.label_alone(changed, pool.envs[0])]
-            visits.inputs = np.concatenate([visits.inputs, changed])
-            visits.actions, visits.weights = np.concatenate(labels), np.append(visits.weights, np.ones(len(changed)))
-        return visits
-
-    def _reset(self, row: int) -> None:
-        choice = int(self.rng.choice(len(self.variations), p=self.chances))
-        self.pool.reset(row, self.next_seed, self.variations[choice])
-        self.pool.dones[row] = self.pool.actions is not None
-        self.next_seed += 1
-        self._elapsed[row] = self._left[row] = 0
-        self.stalls.forget(row)
-
-    def _stalled(self, inputs: Observations) -> NDArray[np.bool_]:
-        """Return which environments are in a state for the third time, or a later one, in this episode."""
-        if not self._has_goal:
-            return np.zeros(len(self.pool), dtype=bool)
-        return self.stalls.visits(self.pool.envs, inputs) >= VISITS
-
-    def _differ(self, actions: NDArray[Any], labels: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return which actions are others than the teacher's, ``(n_envs,)``."""
-        if np.issubdtype(actions.dtype, np.floating):
-            far = np.abs(actions - labels) > _WRONG * self._half_range
-        else:
-            far = actions != labels
-        return np.asarray(far.reshape(len(actions), -1).any(axis=1))
-
-    @property
-    def _half_range(self) -> NDArray[np.float64]:
-        """Half the range of each number of an action; 1 where it has no bounds."""
-        space: Any = self.pool.envs[0].action_space
-        return np.where(np.isfinite(space.high - space.low), (space.high - space.low) / 2, 1.0)
-
-    def _disturbed(self, actions: NDArray[Any]) -> NDArray[Any]:
-        """Return the teacher's actions with some noise, so that it is seen to correct itself."""
-        space: Any = self.pool.envs[0].action_space
-        if np.issubdtype(actions.dtype, np.floating):
-            noisy = actions + _NOISE * self._half_range * self.rng.normal(size=actions.shape)
-            return np.clip(noisy, space.low, space.high).astype(actions.dtype)
-        drawn = self.rng.integers(space.start, space.start + space.n, size=actions.shape)
-        return np.where(self.rng.random(actions.shape) < _NOISE, drawn, actions)

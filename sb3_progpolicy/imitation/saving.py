@@ -5,49 +5,15 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sb3_progpolicy.imitation.candidates import Plain, Scored
 from sb3_progpolicy.imitation.decision_list import DecisionList, Floats
 from sb3_progpolicy.programs.files import write_atomically
-
-Scored = tuple[float, DecisionList]
-_DOUBT = 0.05  # deviation of a score from the mean of many
-_PRICE = 3e-4  # of a number of a plain list, in its score
-
-
-@dataclass(frozen=True)
-class Plain:
-    """A plain list with its scores in series of episodes.
-
-    :param candidate: on raw observations
-    :param scores: of each series that it has played, the last one last
-    """
-
-    candidate: DecisionList
-    scores: tuple[float, ...]
-
-    @property
-    def last(self) -> float:
-        """The score in the last series."""
-        return self.scores[-1]
-
-    def and_then(self, score: float) -> Plain:
-        """Return the list with one more score."""
-        return replace(self, scores=(*self.scores, score))
-
-    def value(self) -> float:
-        """Return the mean score, less a deviation of it, and the price of the numbers."""
-        doubt = _DOUBT * max(1.0, abs(self.last)) / np.sqrt(len(self.scores))
-        return float(np.mean(self.scores) - doubt - _PRICE * n_numbers(self.candidate))
-
-
-def n_numbers(raw: DecisionList) -> int:
-    """Return how many numbers of a list are not 0."""
-    return int(np.count_nonzero(raw.conditions) + np.count_nonzero(raw.controllers))
 
 
 @dataclass(frozen=True)

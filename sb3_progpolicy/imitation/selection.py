@@ -7,11 +7,13 @@ from collections.abc import Mapping
 import numpy as np
 
 from sb3_progpolicy.imitation.actions import ActionCodec
+from sb3_progpolicy.imitation.augmentation import Augment
+from sb3_progpolicy.imitation.candidates import Plain, Scored, n_numbers
 from sb3_progpolicy.imitation.decision_list import DecisionList
 from sb3_progpolicy.imitation.judge import Judge
 from sb3_progpolicy.imitation.learner import Learner
 from sb3_progpolicy.imitation.rollouts import Variations
-from sb3_progpolicy.imitation.saving import Plain, Scored, n_numbers
+from sb3_progpolicy.imitation.visits import Witness
 
 # Of the mean loss, and whether few inputs matter more; the sparsest program first.
 _TOLERANCES = ((0.012, True), (0.004, True), (0.003, False), (0.001, False))
@@ -29,12 +31,14 @@ class Selection:
     :param judge: plays episodes on training variations
     :param beyond: the domain's validation variations, by which a plain list is taken or not; none if empty
     :param codec: of the actions
-    :param augmented: whether states were labelled that no episode comes to
+    :param augment: makes changed copies of states, which are labelled although no episode comes to them
     """
 
-    def __init__(self, learner: Learner, judge: Judge, beyond: Variations, codec: ActionCodec, augmented: bool) -> None:
+    def __init__(
+        self, learner: Learner, judge: Judge, beyond: Variations, codec: ActionCodec, augment: Augment | None
+    ) -> None:
         self.learner, self.judge, self.beyond, self.codec = learner, judge, beyond, codec
-        self.augmented = augmented
+        self.augment = augment
         self.best: Scored | None = None
         self.runners_up: list[Scored] = []
         #: Value of the best list of all, before it was made smaller: what smaller ones are held to.
@@ -75,23 +79,31 @@ class Selection:
             if self._take_over(self.learner.short(n_branches)) is not None:
                 return
 
-    def make_plain(self, series: int) -> None:
-        """Keep the plain lists of the best episodes; the states of the next round are those that the best one visits.
+    def make_plain(self, series: int, n_states: int) -> None:
+        """Keep the plain lists of the best episodes, and label states of all lists' episodes.
 
         :param series: number of these episodes, which are others each time: what is best of many on the same ones would
             soon be best there alone
+        :param n_states: to label
         """
         candidates = self.learner.plain([plain.candidate for plain in self.plain[:_AGAIN]], anew=series % 2 == 0)
         if not candidates:
             return
+        env = self.judge.pool.envs[0]
+        witness = Witness(env.action_space)
         kept: list[Plain] = []
         found: list[Plain] = []
         for plain in [*self.plain[:_AGAIN], *(Plain(candidate, ()) for candidate in candidates)]:
             best = max((one.last for one in (*kept, *found)), default=None)
-            (kept if plain.scores else found).append(plain.and_then(self.score(plain.candidate, best, series)))
+            score = self.judge.score(self.codec.act_of(plain.candidate), best, series, witness)
+            (kept if plain.scores else found).append(plain.and_then(score))
         # Of equal ones the later: it has seen more.
         self.plain = sorted([*reversed(found), *kept, *self.plain[_AGAIN:]], key=Plain.value, reverse=True)[:_FINALISTS]
         self.learner.raw = max([*found, *kept], key=Plain.value).candidate
+        if n_states:
+            visits = witness.visits(n_states, self.learner.rng)
+            visits = visits.with_changed(self.augment, self.judge.teacher, env, self.learner.rng)
+            self.learner.add(visits.inputs, self.codec.encode(visits.actions), visits.weights)
 
     def choose_plain(self) -> None:
         """Go on with the smallest of the best plain lists if its episodes are as good as the best list's.
@@ -102,10 +114,13 @@ class Selection:
         if not self.plain:
             return
         candidates = [plain.candidate for plain in self.plain]
-        dense, *merits = (self._merit(candidate) for candidate in (self.best[1], *candidates))
+        merits: list[float] = []
+        for candidate in candidates:
+            merits.append(self._merit(candidate, max(merits, default=None)))
+        dense = self._merit(self.best[1], max(merits))
         as_good = [index for index, merit in enumerate(merits) if self.judge.as_good(merit, max(merits), share=0.5)]
         index = min(as_good, key=lambda one: n_numbers(candidates[one]))
-        loss = self.learner.loss_of if self.augmented else lambda _: 0.0
+        loss = self.learner.loss_of if self.augment is not None else lambda _: 0.0
         chosen = candidates[index]
         if self.judge.as_good(merits[index] - loss(chosen), dense - loss(self.best[1])):
             self.best, self.is_plain = (self.score(chosen), chosen), True
@@ -142,16 +157,20 @@ class Selection:
             else:
                 return
 
-    def score(self, raw: DecisionList, needed: float | None = None, series: int = 0) -> float:
+    def score(self, raw: DecisionList, needed: float | None = None) -> float:
         """Return the score of a list's episodes; see :meth:`~sb3_progpolicy.imitation.judge.Judge.score`."""
-        return self.judge.score(self.codec.act_of(raw), needed, series)
+        return self.judge.score(self.codec.act_of(raw), needed)
 
-    def _merit(self, candidate: DecisionList) -> float:
-        """Return the score of many episodes, the mean of training and validation variations where there are these."""
+    def _merit(self, candidate: DecisionList, needed: float | None) -> float:
+        """Return the score of many episodes, the mean of training and validation variations where there are these.
+
+        :param candidate: on raw observations
+        :param needed: a merit to compare with; a candidate that is far below it plays fewer episodes
+        """
         act = self.codec.act_of(candidate)
-        scores = [self.judge.score_at_length(act)]
+        scores = [self.judge.score_at_length(act, needed=needed)]
         if self.beyond:
-            scores.append(self.judge.score_at_length(act, self.beyond))
+            scores.append(self.judge.score_at_length(act, self.beyond, needed))
         return float(np.mean(scores))
 
     def _take_over(self, candidate: DecisionList) -> float | None:
@@ -172,4 +191,4 @@ class Selection:
     def _value(self, scored: Scored) -> float:
         """Return the score less the loss where states were labelled that no episode comes to, else the score."""
         score, candidate = scored
-        return score - self.learner.loss_of(candidate) if self.augmented else score
+        return score - self.learner.loss_of(candidate) if self.augment is not None else score

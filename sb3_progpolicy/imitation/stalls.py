@@ -29,11 +29,12 @@ class Stalls:
         #: that are equal to three digits are the same.
         self.deviations: NDArray[np.floating] | None = None
         self._states: list[dict[str, int]] = [{} for _ in range(n_envs)]
-        self._past: list[list[NDArray[np.float32]]] = [[] for _ in range(n_envs)]
+        self._past: list[NDArray[np.float32]] = [np.zeros((0, 0), np.float32) for _ in range(n_envs)]
+        self._lengths = [0] * n_envs
 
     def forget(self, row: int) -> None:
         """Begin an episode."""
-        self._states[row], self._past[row] = {}, []
+        self._states[row], self._lengths[row] = {}, 0
 
     def forget_all(self) -> None:
         """Begin episodes in all environments."""
@@ -60,10 +61,21 @@ class Stalls:
             key, seen = repr(state), self._states[row]
             seen[key] = seen.get(key, 0) + 1
             return seen[key]
-        past = self._past[row]
-        past.append(now.copy())
+        past = self._with_room(row, len(now))
+        past[self._lengths[row]] = now
+        self._lengths[row] += 1
         near = _EQUAL if self.deviations is None else _NEAR * self.deviations
-        return int((np.abs(np.array(past) - now) <= near).all(axis=1).sum())
+        return int((np.abs(past[: self._lengths[row]] - now) <= near).all(axis=1).sum())
+
+    def _with_room(self, row: int, n_inputs: int) -> NDArray[np.float32]:
+        """Return the past of an environment, twice as long where it was full."""
+        past, length = self._past[row], self._lengths[row]
+        if length == len(past) or past.shape[1] != n_inputs:
+            longer = np.empty((max(64, 2 * length), n_inputs), dtype=np.float32)
+            if length:
+                longer[:length] = past[:length]
+            self._past[row] = past = longer
+        return past
 
 
 class Patience:

@@ -19,8 +19,10 @@ from sb3_progpolicy.imitation import algorithm, make_teacher
 from sb3_progpolicy.imitation.augmentation import begun_towers, taller_towers
 from sb3_progpolicy.imitation.decision_list import DecisionList
 from sb3_progpolicy.imitation.learner import Settings
-from sb3_progpolicy.imitation.rollouts import STALL_WEIGHT, Collector, Pool, play
+from sb3_progpolicy.imitation.rollouts import Pool, play
+from sb3_progpolicy.imitation.stalls import Patience
 from sb3_progpolicy.imitation.tasks import training_variations
+from sb3_progpolicy.imitation.visits import STALL_WEIGHT, Collector, Witness
 from sb3_progpolicy.interaction import VecInteractionHistory
 from sb3_progpolicy.programs import Program, ProgramRunner
 
@@ -340,21 +342,36 @@ def test_what_loses_an_episode_weighs_more():
     assert (visits.weights > 1).sum() > visits.n_stalls
 
 
-def test_of_more_steps_those_states_come_first_that_say_most():
-    pool = Pool("PandaPush-v0", 2)
-    collector = Collector(pool, make_teacher("planner", pool.envs[0]), [{"n_objects": 1}], [0], seed=0)
-    collector.begin()
-    wrong, turn = [], iter(range(1000))
+def test_states_of_judged_episodes_are_labelled_half_of_them_where_the_candidate_does_otherwise():
+    with Pool("PandaPush-v0", 3) as pool:
+        teacher, space = make_teacher("planner", pool.envs[0]), pool.envs[0].action_space
+        turn, seen = iter(range(10**6)), []
 
-    def sometimes_wrong(observations):
-        labels = collector.teacher.label(pool.situation())
-        if next(turn) % 5:
-            return labels
-        wrong.extend(observations.copy())
-        return -labels
+        def sometimes_wrong(observations):
+            labels = teacher.label_alone(observations, pool.envs[0])
+            seen.append((observations.copy(), labels, next(turn) % 5 == 0))
+            return -labels if seen[-1][2] else labels
 
-    collector.stalls.deviations = np.zeros(32)  # no state is the same, so the teacher never takes over
-    visits = collector.collect(20, sometimes_wrong, share=0.0, times=3)
-    assert len(visits.inputs) == len(visits.actions) == len(visits.weights) == 2 * 20
-    assert len(wrong) == 2 * 60 // 5
-    assert {row.tobytes() for row in wrong} < {row.tobytes() for row in visits.inputs}
+        witness = Witness(space)
+        play(pool, [{"n_objects": 1}], 3, 7, sometimes_wrong, teacher, watcher=witness)
+        visits = witness.visits(20, np.random.default_rng(0))
+        assert len(visits.inputs) == len(visits.actions) == len(visits.weights) == 20
+        assert (visits.weights == 1).all()  # no episode was lost
+        labels = {row.tobytes(): (label, wrong) for step in seen for row, label, wrong in _rows(*step)}
+        for row, action in zip(visits.inputs, visits.actions, strict=True):
+            np.testing.assert_allclose(action, labels[row.tobytes()][0])
+        assert sum(labels[row.tobytes()][1] for row in visits.inputs) == 10
+
+        def never_closes(observations):
+            return np.zeros((len(observations), 4), dtype=np.float32)
+
+        patience = Patience(3, 12)
+        play(pool, [{"n_objects": 1}], 3, 7, never_closes, teacher, patience=patience, watcher=witness)
+        visits = witness.visits(1000, np.random.default_rng(0))
+        assert 3 * 10 <= len(visits.inputs) <= 3 * 12
+        assert (visits.weights == STALL_WEIGHT).any()
+        assert not (set(labels) & {row.tobytes() for row in visits.inputs[visits.weights > 1]})
+
+
+def _rows(observations, labels, wrong):
+    return [(row, label, wrong) for row, label in zip(observations, labels, strict=True)]

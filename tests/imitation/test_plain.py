@@ -11,11 +11,11 @@ from sb3_progpolicy.imitation.algorithm import N_ROUNDS, _Run
 from sb3_progpolicy.imitation.conditions import fit_priced_condition
 from sb3_progpolicy.imitation.decision_list import Data, DecisionList, rest_losses
 from sb3_progpolicy.imitation.judge import Judge
-from sb3_progpolicy.imitation.learner import Learner, Settings
+from sb3_progpolicy.imitation.learner import Learner, Settings, _drawn
 from sb3_progpolicy.imitation.losses import BoxLoss
 from sb3_progpolicy.imitation.ordering import Order, Ordering
 from sb3_progpolicy.imitation.pieces import PieceFinder, PieceLoss
-from sb3_progpolicy.imitation.rollouts import Pool, play
+from sb3_progpolicy.imitation.rollouts import Episodes, Pool, play
 from sb3_progpolicy.imitation.selection import Selection
 from sb3_progpolicy.imitation.tasks import names_of, validation_variations
 from sb3_progpolicy.imitation.teachers import make_teacher
@@ -204,18 +204,18 @@ def test_plain_list_is_taken_only_if_it_is_as_good_on_validation_variations(monk
         def plain(self, known, anew):
             return [plain, worse]
 
-    selection = Selection(Plain(), judge, validation_variations("PandaReach-v0"), codec, False)
+    selection = Selection(Plain(), judge, validation_variations("PandaReach-v0"), codec, None)
     selection.best, selection.reference = (1.0, best), 1.0
     scores, asked = iter([0.9, 0.8]), []
-    monkeypatch.setattr(judge, "score", lambda act, needed=None, series=0: next(scores, 1.0))
+    monkeypatch.setattr(judge, "score", lambda act, needed=None, series=0, watcher=None: next(scores, 1.0))
     judge.last_result = {"success": 1.0}
 
-    def at_length(act, variations=()):
+    def at_length(act, variations=(), needed=None):
         asked.append(dict(variations[0]) if variations else None)
-        return beyond if len(asked) > 2 and variations else 1.0
+        return beyond if len(asked) <= 4 and variations else 1.0
 
     monkeypatch.setattr(judge, "score_at_length", at_length)
-    selection.make_plain(1)
+    selection.make_plain(1, 0)
     assert selection.learner.raw is plain
     assert [one.candidate for one in selection.plain] == [plain, worse]
     selection.choose_plain()
@@ -234,14 +234,17 @@ def test_next_plain_list_is_made_of_the_one_of_the_best_episodes_and_is_seen_to_
     straight[0, range(3), [names.index(f"target_d{axis}") for axis in "xyz"]] = 20.0
     straight[0, 3, -1] = -1.0
     good, idle = (DecisionList(np.zeros((0, 33)), factor * straight) for factor in (1.0, 0.0))
-    given = []
+    given, added = [], []
 
     class Plain:
-        raw = None
+        raw, rng = None, np.random.default_rng(0)
 
         def plain(self, known, anew):
             given.append((known, anew))
             return [good, idle]
+
+        def add(self, inputs, targets, weights):
+            added.append((inputs, targets, weights))
 
     played = []
 
@@ -250,21 +253,59 @@ def test_next_plain_list_is_made_of_the_one_of_the_best_episodes_and_is_seen_to_
         return play(*arguments, **more)
 
     monkeypatch.setattr(judge_module, "play", counted)
-    selection = Selection(Plain(), judge, (), codec, False)
+    selection = Selection(Plain(), judge, (), codec, None)
     with Pool("PandaReach-v0", 4) as judge.pool:
-        selection.make_plain(1)
-        selection.make_plain(2)
+        selection.make_plain(1, 0)
+        selection.make_plain(2, 50)
+        ((inputs, targets, weights),) = added
+        labels = codec.encode(judge.teacher.label_alone(inputs, judge.pool.envs[0]))
     assert given == [([], False), ([good, idle], True)]
     assert [len(plain.scores) for plain in selection.plain] == [2, 1, 2]
     assert selection.learner.raw is good
     assert played == [6, 2, 6, 2, 2, 4, 2]
     assert judge.last_result["success"] == 0.0
     assert judge.last_result["steps"] == judge.pool.cap
+    assert len(inputs) == 50
+    assert (weights > 1).any()  # the idle list has lost its episodes
+    np.testing.assert_allclose(targets, labels)
+
+
+def test_last_comparison_plays_few_episodes_with_what_is_far_worse(monkeypatch):
+    with Pool("PandaReach-v0", 4) as pool:
+        judge = Judge(pool, [{"n_targets": 1}], 6, 0.015, make_teacher("planner", pool.envs[0]))
+    results = iter([0.9, 0.3, 0.95, 0.9, 0.2])
+    played = []
+
+    def told(pool, variations, n_episodes, *arguments, **more):
+        played.append(n_episodes)
+        value = next(results)
+        return Episodes(np.zeros(n_episodes), np.ones(n_episodes), np.full(n_episodes, value))
+
+    monkeypatch.setattr(judge_module, "play", told)
+    monkeypatch.setattr(Episodes, "score", lambda self, steps: float(self.successes.mean()))
+    assert judge.score_at_length(None) == 0.9
+    assert judge.score_at_length(None, needed=0.9) == 0.3
+    assert judge.score_at_length(None, needed=0.9) == pytest.approx((4 * 0.95 + 8 * 0.9) / 12)
+    assert judge.score_at_length(None, ({"n_targets": 4},), needed=0.9) == 0.2
+    assert played == [12, 4, 4, 8, 4]
+
+
+def test_states_that_are_drawn_stand_for_all():
+    rng = np.random.default_rng(0)
+    weights = np.where(rng.random(4000) < 0.05, 40.0, 1.0)
+    data = Data(np.arange(8000.0).reshape(4000, 2), np.zeros((4000, 1)), weights)
+    few = _drawn(data, 1000, rng)
+    assert abs(len(few) - 1000) < 100
+    assert few.weights.sum() == pytest.approx(weights.sum(), rel=0.05)
+    heavy = {row.tobytes() for row in data.inputs[weights > 1]}
+    assert heavy < {row.tobytes() for row in few.inputs}
+    assert set(few.weights[few.weights > 20]) == {40.0}
+    assert _drawn(data, 4000, rng) is data
 
 
 def test_only_states_that_no_episode_comes_to_count_beside_the_episodes():
     with Pool("PandaStack-v0", 2) as pool:
         arguments = (pool, "planner", "PandaStack-v0", [{"n_objects": 1}], 0, 3, (), 2, 0.015)
         runs = {augment: _Run(*arguments, augment) for augment in (None, "begun_towers", "taller_towers")}
-    assert [run.selection.augmented for run in runs.values()] == [False, False, True]
+    assert [run.selection.augment is not None for run in runs.values()] == [False, False, True]
     assert [len(run.selection.beyond) for run in runs.values()] == [0, 0, 0]  # given tasks have no validation set
