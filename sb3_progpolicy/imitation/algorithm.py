@@ -69,6 +69,7 @@ def imitate(
     interaction: bool = False,
     ignore: Sequence[str] = IGNORED,
     score_tolerance: float = 0.015,
+    plain_tolerance: float = 0.05,
     n_episodes: int = 24,
     env_kwargs: Mapping[str, Any] | None = None,
     augment: str | Augment | None = None,
@@ -101,6 +102,8 @@ def imitate(
     :param interaction: whether the program reads its previous action, reward and done flag, too
     :param ignore: names of inputs that the program must not read
     :param score_tolerance: share of the score that fewer and rounder numbers may cost
+    :param plain_tolerance: share of the score that a plain program may cost, which a person can read; 0 takes it only
+        if it is at least as good as the list that all inputs are open to
     :param n_episodes: of each validation, on training variations; the last ones have twice as many
     :param env_kwargs: constructor arguments of the environment
     :param augment: makes states that were not visited, which the teacher labels too: a function from observations and
@@ -127,9 +130,15 @@ def imitate(
             f"n_timesteps={n_timesteps}, max_conditions={max_conditions}, n_episodes={n_episodes} are not accepted; "
             f"at least {n_shares * n_envs} (for n_envs={n_envs}), 0 and 1 are"
         )
+    if not (score_tolerance >= 0 and plain_tolerance >= 0):
+        raise ValueError(
+            f"score_tolerance={score_tolerance} and plain_tolerance={plain_tolerance} are not accepted; shares of at "
+            "least 0 are"
+        )
     begin = make_starts(augment)
     with Pool(env_id, n_envs, env_kwargs, interaction, begin) as pool:
-        run = _Run(pool, teacher, env_id, tasks, seed, max_conditions + 1, ignore, n_episodes, score_tolerance, augment)
+        tolerances = score_tolerance, plain_tolerance
+        run = _Run(pool, teacher, env_id, tasks, seed, max_conditions + 1, ignore, n_episodes, tolerances, augment)
         n_states = n_timesteps // (len(SHARES) + 1 if remembers else run.n_rounds + 1)
         with Pool(env_id, run.n_rows(n_states), env_kwargs, interaction, begin) as visited:
             if remembers:
@@ -150,7 +159,7 @@ class _Run:
         max_branches: int,
         ignore: Sequence[str],
         n_episodes: int,
-        score_tolerance: float,
+        tolerances: tuple[float, float],
         augment: str | Augment | None,
     ) -> None:
         env: Any = pool.envs[0]
@@ -164,6 +173,7 @@ class _Run:
         # The smaller sizes are the ends of the larger ones, which therefore say more.
         ranked = list(zip(self.variations, ranks, strict=True))
         validation = [one for least in (largest - 1, largest) for one, rank in ranked if rank >= least]
+        score_tolerance, plain_tolerance = tolerances
         self.judge = Judge(pool, validation, n_episodes, score_tolerance, self.teacher)
         self.ranks, self.augmentation = ranks, make_augmentation(augment, self.inputs)
         self.origin: dict[str, Any] = {"env": env_id, "seed": seed, "teacher": self.teacher.name}
@@ -172,7 +182,7 @@ class _Run:
         readable = np.array([name not in ignore for name in self.inputs])
         self.learner = Learner(self.codec, readable, Settings(max_branches, seed))
         beyond = validation_variations(env_id) if tasks is None else ()
-        self.selection = Selection(self.learner, self.judge, beyond, self.codec, self.augmentation)
+        self.selection = Selection(self.learner, self.judge, beyond, self.codec, self.augmentation, plain_tolerance)
         self.n_labelled = 0
         #: Teachers with continuous actions may be made of pieces.
         self.n_plain_rounds = N_PLAIN_ROUNDS if self.spec.kind == "box" else 0

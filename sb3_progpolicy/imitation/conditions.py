@@ -135,6 +135,22 @@ def fit_priced_condition(
     return best, largest
 
 
+def refit_condition(inputs: Floats, gains: Floats, start: Floats) -> tuple[Floats, float]:
+    """Return the condition of the same inputs as a known one whose sum of gains is the largest, and this sum.
+
+    :param inputs: ``(n, width)``
+    :param gains: ``(n,)``
+    :param start: the known condition
+    """
+    kept = start != 0
+    kept[-1] = True
+    fitted, _ = fit_condition(inputs[:, kept], gains, start[kept], ridges=(1e-4,), cautions=(1.0, 2.0))
+    fitted, gained = improve(inputs[:, kept], gains, start[kept] if fitted is None else fitted)
+    condition = np.zeros(len(start))
+    condition[kept] = fitted
+    return condition, gained
+
+
 def _sample(gains: Floats) -> tuple[np.ndarray, Floats]:
     """Return which states a regression looks at, and what each of them counts.
 

@@ -95,4 +95,9 @@ class Judge:
 
     def as_good(self, reached: float, score: float, share: float = 1.0) -> bool:
         """Return whether a score is as good as another, within a share of the tolerance."""
-        return reached >= score - share * self.tolerance * max(1.0, abs(score))
+        return within(reached, score, share * self.tolerance)
+
+
+def within(reached: float, score: float, tolerance: float) -> bool:
+    """Return whether a score is as good as another, within a share of it (of 1, if it is smaller)."""
+    return reached >= score - tolerance * max(1.0, abs(score))

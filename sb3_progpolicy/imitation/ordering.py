@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_progpolicy.imitation.conditions import fit_condition, fit_priced_condition
+from sb3_progpolicy.imitation.conditions import fit_condition, fit_priced_condition, refit_condition
 from sb3_progpolicy.imitation.decision_list import Data, Floats, rest_losses
 
 PRICE = 0.001  # of an input of a condition, in mean loss
@@ -64,7 +64,7 @@ class Ordering:
             longer = self._with_one_more(order)
             if longer is None:
                 break
-            order = self._swept(longer)
+            order = self._swept(longer, same_inputs=True)
         return self._shortened(self._swept(order))
 
     def cost(self, order: Order) -> float:
@@ -109,8 +109,11 @@ class Ordering:
                 best, most = order.insert(position, fewer, piece), gain
         return best
 
-    def _swept(self, order: Order) -> Order:
-        """Return the order with each condition fitted again, given all others, then the best piece for each branch."""
+    def _swept(self, order: Order, same_inputs: bool = False) -> Order:
+        """Return the order with each condition fitted again, given all others, then the best piece for each branch.
+
+        :param same_inputs: whether each condition keeps its inputs, which is far quicker
+        """
         conditions = list(order.conditions)
         for index in reversed(range(len(conditions))):
             present = Order(tuple(conditions), order.pieces)
@@ -119,7 +122,12 @@ class Ordering:
             if here.sum() < 20:
                 continue
             old = gains[here & (self.inputs @ conditions[index] >= 0)].sum() - _price(conditions[index])
-            condition, gain = fit_priced_condition(self.inputs[here], gains[here], conditions[index], PRICE)
+            condition: Floats | None
+            if same_inputs:
+                condition, gain = refit_condition(self.inputs[here], gains[here], conditions[index])
+                gain -= _price(condition)
+            else:
+                condition, gain = fit_priced_condition(self.inputs[here], gains[here], conditions[index], PRICE)
             if condition is not None and gain > old:
                 conditions[index] = condition
         order = Order(tuple(conditions), order.pieces)

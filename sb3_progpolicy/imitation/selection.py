@@ -10,7 +10,7 @@ from sb3_progpolicy.imitation.actions import ActionCodec
 from sb3_progpolicy.imitation.augmentation import Augment
 from sb3_progpolicy.imitation.candidates import Plain, Scored, n_numbers
 from sb3_progpolicy.imitation.decision_list import DecisionList
-from sb3_progpolicy.imitation.judge import Judge
+from sb3_progpolicy.imitation.judge import Judge, within
 from sb3_progpolicy.imitation.learner import Learner
 from sb3_progpolicy.imitation.rollouts import Variations
 from sb3_progpolicy.imitation.visits import Witness
@@ -32,13 +32,20 @@ class Selection:
     :param beyond: the domain's validation variations, by which a plain list is taken or not; none if empty
     :param codec: of the actions
     :param augment: makes changed copies of states, which are labelled although no episode comes to them
+    :param plain_tolerance: share of the score that a plain list may cost
     """
 
     def __init__(
-        self, learner: Learner, judge: Judge, beyond: Variations, codec: ActionCodec, augment: Augment | None
+        self,
+        learner: Learner,
+        judge: Judge,
+        beyond: Variations,
+        codec: ActionCodec,
+        augment: Augment | None,
+        plain_tolerance: float,
     ) -> None:
         self.learner, self.judge, self.beyond, self.codec = learner, judge, beyond, codec
-        self.augment = augment
+        self.augment, self.plain_tolerance = augment, plain_tolerance
         self.best: Scored | None = None
         self.runners_up: list[Scored] = []
         #: Value of the best list of all, before it was made smaller: what smaller ones are held to.
@@ -106,7 +113,7 @@ class Selection:
             self.learner.add(visits.inputs, self.codec.encode(visits.actions), visits.weights)
 
     def choose_plain(self) -> None:
-        """Go on with the smallest of the best plain lists if its episodes are as good as the best list's.
+        """Go on with the smallest of the best plain lists if its episodes are nearly as good as the best list's.
 
         Episodes beyond training count as much as those of training.
         """
@@ -122,7 +129,7 @@ class Selection:
         index = min(as_good, key=lambda one: n_numbers(candidates[one]))
         loss = self.learner.loss_of if self.augment is not None else lambda _: 0.0
         chosen = candidates[index]
-        if self.judge.as_good(merits[index] - loss(chosen), dense - loss(self.best[1])):
+        if within(merits[index] - loss(chosen), dense - loss(self.best[1]), self.plain_tolerance):
             self.best, self.is_plain = (self.score(chosen), chosen), True
             self.learner.raw, self.reference = self.best[1], self.best[0]
             self.result = self.judge.last_result

@@ -1,5 +1,7 @@
 """Plain lists: the pieces of a list that is known, found again and put in order."""
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -165,7 +167,7 @@ def test_states_in_which_a_student_loses_have_a_share_of_the_weight_at_most(n_lo
     np.testing.assert_array_equal(found[n_losing:], 1.0)
 
 
-def test_reaching_is_imitated_by_a_few_numbers_and_goes_on_after_an_interruption(monkeypatch, tmp_path):
+def test_reaching_is_imitated_by_a_few_numbers_and_the_same_after_an_interruption(monkeypatch, tmp_path):
     seen, reset = set(), Pool.reset
 
     def spy(self, row, seed, variation):
@@ -175,23 +177,21 @@ def test_reaching_is_imitated_by_a_few_numbers_and_goes_on_after_an_interruption
     monkeypatch.setattr(Pool, "reset", spy)
     monkeypatch.setattr(algorithm, "N_PLAIN_ROUNDS", 4)
     arguments = {"n_timesteps": 4000, "n_episodes": 6, "max_conditions": 0, "n_envs": 6}
-    whole = imitate("planner", "PandaReach-v0", **arguments)
+    state, early = tmp_path / "state.npz", tmp_path / "early.npz"
+
+    def keep(progress):
+        if progress.round == N_ROUNDS + 1:
+            shutil.copy(state, early)
+
+    whole = imitate("planner", "PandaReach-v0", **arguments, callback=keep, checkpoint=state)
     assert len(whole.conditions) == 0
     assert count_numbers(whole) <= 10
     assert seen == {(("n_targets", n),) for n in (1, 2, 3, 4)}  # trained on 1 to 3; 4 are the validation's
-
-    def interrupt(progress):
-        if progress.round == N_ROUNDS + 1:
-            raise KeyboardInterrupt
-
-    state = tmp_path / "state.npz"
-    with pytest.raises(KeyboardInterrupt):
-        imitate("planner", "PandaReach-v0", **arguments, callback=interrupt, checkpoint=state)
-    resumed = imitate("planner", "PandaReach-v0", **arguments, checkpoint=state)
+    resumed = imitate("planner", "PandaReach-v0", **arguments, checkpoint=early)
     assert resumed.body == whole.body
 
 
-@pytest.mark.parametrize("beyond", [1.0, 0.5], ids=["as good beyond", "worse beyond"])
+@pytest.mark.parametrize("beyond", [1.0, 0.92, 0.85], ids=["as good beyond", "a little worse", "worse beyond"])
 def test_plain_list_is_taken_only_if_it_is_as_good_on_validation_variations(monkeypatch, beyond):
     with Pool("PandaReach-v0", 4) as pool:
         codec = ActionCodec(pool.spec, ("move_x", "move_y", "move_z", "open"))
@@ -204,7 +204,7 @@ def test_plain_list_is_taken_only_if_it_is_as_good_on_validation_variations(monk
         def plain(self, known, anew):
             return [plain, worse]
 
-    selection = Selection(Plain(), judge, validation_variations("PandaReach-v0"), codec, None)
+    selection = Selection(Plain(), judge, validation_variations("PandaReach-v0"), codec, None, 0.05)
     selection.best, selection.reference = (1.0, best), 1.0
     scores, asked = iter([0.9, 0.8]), []
     monkeypatch.setattr(judge, "score", lambda act, needed=None, series=0, watcher=None: next(scores, 1.0))
@@ -220,8 +220,8 @@ def test_plain_list_is_taken_only_if_it_is_as_good_on_validation_variations(monk
     assert [one.candidate for one in selection.plain] == [plain, worse]
     selection.choose_plain()
     assert asked == [None, {"n_targets": 4}] * 3
-    assert selection.is_plain == (beyond == 1.0)
-    assert selection.best[1] is (plain if beyond == 1.0 else best)
+    assert selection.is_plain == (beyond > 0.9)  # the mean of training and validation may cost a twentieth
+    assert selection.best[1] is (plain if beyond > 0.9 else best)
     assert selection.learner.raw is plain  # the states that it visits are those to learn from
 
 
@@ -253,7 +253,7 @@ def test_next_plain_list_is_made_of_the_one_of_the_best_episodes_and_is_seen_to_
         return play(*arguments, **more)
 
     monkeypatch.setattr(judge_module, "play", counted)
-    selection = Selection(Plain(), judge, (), codec, None)
+    selection = Selection(Plain(), judge, (), codec, None, 0.05)
     with Pool("PandaReach-v0", 4) as judge.pool:
         selection.make_plain(1, 0)
         selection.make_plain(2, 50)
@@ -305,7 +305,7 @@ def test_states_that_are_drawn_stand_for_all():
 
 def test_only_states_that_no_episode_comes_to_count_beside_the_episodes():
     with Pool("PandaStack-v0", 2) as pool:
-        arguments = (pool, "planner", "PandaStack-v0", [{"n_objects": 1}], 0, 3, (), 2, 0.015)
+        arguments = (pool, "planner", "PandaStack-v0", [{"n_objects": 1}], 0, 3, (), 2, (0.015, 0.05))
         runs = {augment: _Run(*arguments, augment) for augment in (None, "begun_towers", "taller_towers")}
     assert [run.selection.augment is not None for run in runs.values()] == [False, False, True]
     assert [len(run.selection.beyond) for run in runs.values()] == [0, 0, 0]  # given tasks have no validation set
