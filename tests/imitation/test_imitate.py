@@ -368,7 +368,7 @@ def test_states_of_judged_episodes_are_labelled_half_of_them_where_the_candidate
             return np.zeros((len(observations), 4), dtype=np.float32)
 
         patience = Patience(3, 12)
-        play(pool, [{"n_objects": 1}], 3, 7, never_closes, teacher, patience=patience, watcher=witness)
+        play(pool, [{"n_objects": 1}], 3, 70, never_closes, teacher, patience=patience, watcher=witness)
         visits = witness.visits(1000, np.random.default_rng(0))
         assert 3 * 10 <= len(visits.inputs) <= 3 * 12
         assert (visits.weights == STALL_WEIGHT).any()
