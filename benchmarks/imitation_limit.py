@@ -5,8 +5,9 @@
 The planner knows the whole map, the program sees a window of it. Where no star is in sight, the planner's action is not
 a function of the window. The best that imitation can learn there is the action that is most often right, one for each
 window of the training maps, learned by heart from many starts with one star. This student does so, and does what the
-planner does wherever it sees a star. A program that has only labels to learn from can hardly reach more. Writes ``benchmarks/results/imitation_limit.csv`` and a ``.json`` with command, commit and
-versions.
+planner does wherever it sees a star. A program that has only labels to learn from can hardly reach more.
+
+Writes ``benchmarks/results/imitation_limit.csv`` and a ``.json`` with command, commit and versions.
 """
 
 from __future__ import annotations
