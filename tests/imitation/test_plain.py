@@ -10,7 +10,7 @@ from sb3_progpolicy.imitation import algorithm, imitate
 from sb3_progpolicy.imitation import judge as judge_module
 from sb3_progpolicy.imitation.actions import ActionCodec
 from sb3_progpolicy.imitation.algorithm import N_ROUNDS, _Run
-from sb3_progpolicy.imitation.conditions import fit_priced_condition
+from sb3_progpolicy.imitation.conditions import fit_priced_condition, refit_condition
 from sb3_progpolicy.imitation.decision_list import Data, DecisionList, rest_losses
 from sb3_progpolicy.imitation.judge import Judge
 from sb3_progpolicy.imitation.learner import Learner, Settings, _drawn
@@ -139,6 +139,20 @@ def test_condition_has_the_inputs_that_are_worth_their_price():
     assert gained == pytest.approx(gains[gains > 0].sum() - 2e-4, abs=2e-3)
     assert less < gained
     assert fit_priced_condition(inputs, -np.abs(gains), start, price=0.0) == (None, 0.0)
+
+
+def test_condition_that_is_fitted_again_keeps_its_inputs():
+    rng = np.random.default_rng(0)
+    inputs = np.column_stack([rng.normal(size=(2000, 6)), np.ones(2000)])
+    gains = np.where(inputs[:, 1] + 0.1 * inputs[:, 3] > 0.2, 1.0, -1.0) / 2000
+    start = np.array([0.0, 1.0, 0.0, 0.0, 0.5, 0.0, 0.4])
+    condition, gained = refit_condition(inputs, gains, start)
+    assert np.flatnonzero(condition).tolist() == [1, 4, 6]
+    assert abs(condition[4]) < 0.05 * condition[1]
+    assert condition[6] / condition[1] == pytest.approx(-0.2, abs=0.02)
+    assert gained == pytest.approx(gains[inputs @ condition >= 0].sum())
+    nothing = -np.abs(gains)
+    assert refit_condition(inputs, nothing, start)[1] <= 0
 
 
 def test_learner_makes_a_plain_list_of_box_labels_alone():
