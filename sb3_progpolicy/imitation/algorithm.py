@@ -108,7 +108,7 @@ def imitate(
     :param env_kwargs: constructor arguments of the environment
     :param augment: makes states that were not visited, which the teacher labels too: a function from observations and
         a generator to observations, or ``"taller_towers"`` for PandaStack; ``"begun_towers"`` begins half of its
-        episodes with a tower of one to four blocks instead. What was learned so was shown more than the training
+        episodes with a tower of one to five blocks instead. What was learned so was shown more than the training
         variations; the metadata say so
     :param callback: is called after each round
     :param checkpoint: file in which the state is kept after each round; one that exists is gone on from

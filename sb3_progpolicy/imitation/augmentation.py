@@ -65,11 +65,15 @@ AUGMENTATIONS: dict[str, Callable[[Sequence[str]], Augment]] = {"taller_towers":
 
 #: Begins an episode of an environment, by a seed and a variation, in another way than ``reset``; the observation.
 Begin = Callable[[Any, int, Mapping[str, Any]], Observations]
-_MOST_BEGUN = 4  # blocks; the gripper's first place is just above so many
+_MOST_BEGUN, _MOST_BELOW = 5, 4  # blocks of a tower; of those over which the gripper's neutral place is
+_MOST_OBJECTS = 8  # of PandaStack
 
 
 def begun_towers(env: Any, seed: int, variation: Mapping[str, Any]) -> Observations:
-    """Begin an episode of PandaStack, in half of the cases with a tower of one to four other blocks.
+    """Begin an episode of PandaStack, in half of the cases with a tower of one to five other blocks.
+
+    The hand is then at its neutral place or, in half of these cases and over towers of five, where it has just put the
+    last block down. There are eight blocks at most.
 
     :param env: the environment
     :param seed: of the episode
@@ -79,9 +83,13 @@ def begun_towers(env: Any, seed: int, variation: Mapping[str, Any]) -> Observati
     if not hasattr(env.unwrapped, "begin_tower"):
         raise ValueError("augment='begun_towers' is not accepted: only PandaStack has towers")
     rng = np.random.default_rng((seed, 1))
-    n_done = 0 if rng.random() < 0.5 else int(rng.integers(1, _MOST_BEGUN + 1))
-    env.reset(seed=seed, options={**variation, "n_objects": variation.get("n_objects", 1) + n_done})
-    return np.asarray(env.unwrapped.begin_tower(n_done))
+    n_objects = variation.get("n_objects", 1)
+    most = max(min(_MOST_BEGUN, _MOST_OBJECTS - n_objects), 0)
+    n_done = 0 if rng.random() < 0.5 else int(rng.integers(min(most, 1), most + 1))
+    above = n_done > 0 and (n_done > _MOST_BELOW or rng.random() < 0.5)
+    options = {**variation, "n_objects": n_objects + n_done, "n_done": n_done if above else 0}
+    observation = env.reset(seed=seed, options=options)[0]
+    return np.asarray(observation if above else env.unwrapped.begin_tower(n_done))
 
 
 #: Names of the ready ones.
