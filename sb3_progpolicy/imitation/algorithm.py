@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from sb3_progpolicy.imitation.actions import ActionCodec
 from sb3_progpolicy.imitation.augmentation import Augment, make_augmentation, make_starts
@@ -136,7 +137,9 @@ def imitate(
             "least 0 are"
         )
     begin = make_starts(augment)
-    with Pool(env_id, n_envs, env_kwargs, interaction, begin) as pool:
+    # The matrices are small: several threads of BLAS are slower than one, most of all where another process runs.
+    one_thread = threadpool_limits(1, user_api="blas")
+    with one_thread, Pool(env_id, n_envs, env_kwargs, interaction, begin) as pool:
         tolerances = score_tolerance, plain_tolerance
         run = _Run(pool, teacher, env_id, tasks, seed, max_conditions + 1, ignore, n_episodes, tolerances, augment)
         n_states = n_timesteps // (len(SHARES) + 1 if remembers else run.n_rounds + 1)

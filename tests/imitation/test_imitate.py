@@ -11,6 +11,7 @@ from gymnasium import spaces
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from progpolicy_envs.panda import PandaStackEnv
 from sb3_progpolicy import compare_with_teacher, evaluate_program, imitate, load_pretrained
@@ -182,6 +183,26 @@ def test_planner_is_imitated_on_training_variations_only(monkeypatch):
     program = imitate("planner", "Stacking-v0", **{**SMALL, "max_conditions": 2})
     assert seen == {(("n_plates", n),) for n in (1, 2, 3, 4)}
     assert program.metadata["teacher"] == "planner"
+
+
+def test_imitation_takes_one_thread_of_blas_and_leaves_the_others_as_they_were():
+    pytest.importorskip("scipy.linalg")  # has a BLAS of its own, which is loaded then
+
+    def threads():
+        return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+
+    seen = []
+
+    def stop(progress):
+        seen.append(threads())
+        raise KeyboardInterrupt
+
+    with threadpool_limits(2, user_api="blas"):
+        before = threads()
+        with pytest.raises(KeyboardInterrupt):
+            imitate(balance, "CartPole-v1", **SMALL, callback=stop)
+        assert threads() == before
+    assert seen == [[1] * len(before)]
 
 
 @pytest.mark.parametrize(
