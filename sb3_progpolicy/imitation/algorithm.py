@@ -221,6 +221,9 @@ class _Run:
             **self.origin,
             "n_steps": n_steps,
             "max_branches": self.learner.settings.max_branches,
+            "n_episodes": self.judge.n_episodes,
+            "score_tolerance": self.judge.tolerance,
+            "plain_tolerance": self.selection.plain_tolerance,
             "inputs": [name for name, read in zip(self.inputs, self.learner.readable, strict=True) if read],
             "tasks": [dict(variation) for variation in self.variations],
         }

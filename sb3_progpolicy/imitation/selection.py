@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -121,10 +121,11 @@ class Selection:
         if not self.plain:
             return
         candidates = [plain.candidate for plain in self.plain]
-        merits: list[float] = []
+        parts: list[list[float]] = []
         for candidate in candidates:
-            merits.append(self._merit(candidate, max(merits, default=None)))
-        dense = self._merit(self.best[1], max(merits))
+            parts.append(self._merits(candidate, max(parts, key=np.mean, default=[])))
+        merits = [float(np.mean(part)) for part in parts]
+        dense = float(np.mean(self._merits(self.best[1], max(parts, key=np.mean))))
         as_good = [index for index, merit in enumerate(merits) if self.judge.as_good(merit, max(merits), share=0.5)]
         index = min(as_good, key=lambda one: n_numbers(candidates[one]))
         loss = self.learner.loss_of if self.augment is not None else lambda _: 0.0
@@ -168,17 +169,16 @@ class Selection:
         """Return the score of a list's episodes; see :meth:`~sb3_progpolicy.imitation.judge.Judge.score`."""
         return self.judge.score(self.codec.act_of(raw), needed)
 
-    def _merit(self, candidate: DecisionList, needed: float | None) -> float:
-        """Return the score of many episodes, the mean of training and validation variations where there are these.
+    def _merits(self, candidate: DecisionList, needed: Sequence[float]) -> list[float]:
+        """Return the scores of many episodes on training and, where there are these, on validation variations.
 
         :param candidate: on raw observations
-        :param needed: a merit to compare with; a candidate that is far below it plays fewer episodes
+        :param needed: scores to compare with, if there are any; what is far below one of them plays fewer episodes
         """
         act = self.codec.act_of(candidate)
-        scores = [self.judge.score_at_length(act, needed=needed)]
-        if self.beyond:
-            scores.append(self.judge.score_at_length(act, self.beyond, needed))
-        return float(np.mean(scores))
+        places: list[Variations] = [(), self.beyond] if self.beyond else [()]
+        wanted: Sequence[float | None] = needed or [None] * len(places)
+        return [self.judge.score_at_length(act, place, least) for place, least in zip(places, wanted, strict=True)]
 
     def _take_over(self, candidate: DecisionList) -> float | None:
         """Go on with a smaller list if its loss is not far from the best one's and its episodes are as good.

@@ -154,6 +154,9 @@ def test_interrupted_imitation_goes_on_as_if_nothing_had_happened(balanced, tmp_
     assert program.metadata["labelled_states"] == 13 * (2000 // 13)
     with pytest.raises(ValueError, match="remove it to begin anew"):
         imitate(balance, "CartPole-v1", seed=9, checkpoint=state, **SMALL)
+    more = {**SMALL, "score_tolerance": 0.1, "plain_tolerance": 0.2}
+    with pytest.raises(ValueError, match="another score_tolerance, plain_tolerance;"):
+        imitate(balance, "CartPole-v1", seed=1, checkpoint=state, **more)
 
 
 def test_branches_that_hardly_ever_act_go_while_episodes_stay_as_good():
@@ -272,7 +275,7 @@ def test_model_sees_what_it_saw_in_training(kind):
     pool = Pool("Pendulum-v1", 3)
     teacher = make_teacher(model, pool.envs[0])
     for row in range(3):
-        pool.reset(row, 300 + row, {})
+        pool.reset(row, 7 + row, {})
     for wanted in expected:
         actions = teacher.label(pool.situation())
         np.testing.assert_allclose(actions, wanted, atol=1e-5)
