@@ -127,16 +127,16 @@ class PieceFinder:
     def find(self, known: Sequence[Floats] = ()) -> Floats:
         """Return pieces ``(n_pieces, n_outputs, n_inputs + 1)`` that explain nearly all states, each needed for some.
 
-        :param known: pieces to begin with; then at most four others are looked for, and each from half as many states
+        :param known: pieces to begin with; then at most four others are looked for
         """
         pieces, unexplained = [], np.ones(len(self.data), dtype=bool)
         for piece in known:
             pieces.append(self._widened(piece, _WIDENING[1:3]))
             unexplained &= ~self._exact(pieces[-1])
-        limit, n_tries = (len(pieces) + _NEW, _TRIES) if pieces else (_MOST + _NEW, _TRIES)
+        limit = (len(pieces) or _MOST) + _NEW
         while len(pieces) < limit and unexplained.mean() >= _UNEXPLAINED:
             best, most = None, _LEAST
-            states = self.rng.choice(np.flatnonzero(unexplained), n_tries)
+            states = self.rng.choice(np.flatnonzero(unexplained), _TRIES)
             first = [self._around(int(state), trimmed=index % 2 == 1) for index, state in enumerate(states)]
             nearly = self.loss.matrix(self.data, np.array(first))[unexplained] < _WIDENING[0]
             for index in np.argsort(-(self.shares[unexplained] @ nearly))[:_PROMISING]:
@@ -161,7 +161,7 @@ class PieceFinder:
         return np.asarray(self.loss.matrix(self.data, piece[None])[:, 0] < EXACT)
 
     def _around(self, state: int, trimmed: bool) -> Floats:
-        """Return the piece that explains a state and its neighbours.
+        """Return the piece that explains a state and its neighbours, fitted to these alone.
 
         :param state: index
         :param trimmed: whether only the half of the neighbours that fits best is kept, since others may be of another

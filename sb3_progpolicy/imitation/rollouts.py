@@ -142,13 +142,17 @@ class Watcher(Protocol):
         """See a step.
 
         :param rows: of the pool in which an episode goes on
-        :param inputs: what is acted on, of all rows
-        :param actions: what is done, of all rows
-        :param labels: what the teacher would have done, of all rows
+        :param inputs: what is acted on, of all rows, ``(n_envs, n_inputs)``
+        :param actions: what is done, of all rows, ``(n_envs, *action_shape)``
+        :param labels: what the teacher would have done, of all rows, of the same shape
         """
 
     def ended(self, row: int, success: bool) -> None:
-        """See the end of an episode."""
+        """See the end of an episode.
+
+        :param row: of the pool
+        :param success: whether the goal was reached; ``True`` where the environment reports none
+        """
 
 
 def play(
