@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 from progpolicy_envs import get_domain
 from sb3_progpolicy.benchmark.statistics import Scores, interquartile_mean, mean_over_seeds, performance_profile
@@ -19,9 +20,9 @@ STYLES = ("-", "--", "-.", ":")
 
 
 def look(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return a colour and a line style for each method, the same in all pictures of a report."""
+    """Return a colour and a line style for each method, the same in all pictures of a report; the first lie on top."""
     return {
-        method: {"color": COLOURS[number % len(COLOURS)], "linestyle": STYLES[number % len(STYLES)]}
+        method: {"color": COLOURS[number % len(COLOURS)], "linestyle": STYLES[number % len(STYLES)], "zorder": 3 - number / 100}
         for number, method in enumerate(methods)
     }
 
@@ -44,6 +45,7 @@ def curves(cells: Sequence[Row], envs: Sequence[str], looks: Mapping[str, dict[s
         sizes = sorted({str(variation[get_domain(env).size]) for variation in get_domain(env).validation})
         axes.set_title(f"{env}, {get_domain(env).size} {', '.join(sizes)}", fontsize=10)
         axes.set_xlabel("environment steps")
+        axes.xaxis.set_major_formatter(EngFormatter())
         axes.set_ylabel("steps to the goal" if number == 0 else "")
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)

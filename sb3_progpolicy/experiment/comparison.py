@@ -68,6 +68,7 @@ def draw_comparison(compared: Sequence[Compared]) -> Any:
     :param compared: the runs
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter
 
     has_curves = any(run.curve for run in compared)
     figure = Figure(figsize=(11 if has_curves else 6.4, 4), layout="constrained")
@@ -85,6 +86,7 @@ def draw_comparison(compared: Sequence[Compared]) -> Any:
         for run in compared:
             axes[1].plot(*(zip(*run.curve, strict=True) if run.curve else ((), ())), marker=".", label=run.name)
         axes[1].set_xlabel("environment steps")
+        axes[1].xaxis.set_major_formatter(EngFormatter())
         axes[1].set_ylabel("steps to the goal, validation variations")
         axes[1].set_ylim(bottom=0)
     for panel in axes:
