@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -127,11 +127,16 @@ def _changes(activity: Activity) -> list[int]:
 
 def _label(condition: Condition, index: int, number: Decimals, program: ProgramData) -> str:
     """Return a condition in a few words."""
-    if condition.cell != "affine":
+    if condition.remembers:
         return f"B{index + 1}: memory ({condition.cell})"
-    terms = largest_terms(condition.readout, program.input_names, number.digits, _TERMS)
-    text = " ".join(f"{'-' if weight < 0 else '+'} {number.factor(weight, '*')}{name}" for weight, name in terms.shown)
-    constant = f"{number(condition.readout_bias)} " if condition.readout_bias else ""
-    text = f"B{index + 1} = {constant}{text}{' + ...' if terms.n_dropped else ''} >= 0"
+    sums = [_sum(constant, weights, number, program.input_names) for constant, weights in condition.sums]
+    text = sums[0] if condition.cell == "affine" else f"min({', '.join(sums)})"
+    text = f"B{index + 1} = {text} >= 0"
     text = text if len(text) <= _LABEL else f"{text[: _LABEL - 3]}..."
     return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
+def _sum(constant: float, weights: Sequence[float], number: Decimals, names: Sequence[str]) -> str:
+    terms = largest_terms(weights, names, number.digits, _TERMS)
+    text = " ".join(f"{'-' if weight < 0 else '+'} {number.factor(weight, '*')}{name}" for weight, name in terms.shown)
+    return f"{number(constant) + ' ' if constant else ''}{text}{' + ...' if terms.n_dropped else ''}"

@@ -91,7 +91,7 @@ def finetune(
     :param seed: of everything random
     :return: the program that comes of it, and how it was learned, as in ``learned_by``
     """
-    stateless = all(condition.cell == "affine" for condition in program.conditions)
+    stateless = not any(condition.remembers for condition in program.conditions)
     model = ReptilePPO(
         "PRLPolicy" if stateless else "ProgPolicy",
         env_id,

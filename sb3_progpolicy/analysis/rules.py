@@ -96,7 +96,8 @@ class Rules:
             self.n_terms += self.switched.terms.get(index, count_of(original))
             self.lower_bound += self.switched.bounds.get(index, 0)
             if index not in self.switched.terms:
-                self.notes.append(f"condition {index + 1} has a memory and stays as it is")
+                what = "has a memory" if original.remembers else "is the least of several sums"
+                self.notes.append(f"condition {index + 1} {what} and stays as it is")
             return original
         reaching = self.situations.branches >= index
         inputs, true = self.situations.inputs[reaching], self.situations.branches[reaching] == index

@@ -275,7 +275,7 @@ def _relabelled(met: Situations, n_known: int, program: ProgramData, planner: bo
     :param program: the original
     :param planner: whether the planner has said what may be done
     """
-    if any(condition.cell != "affine" for condition in program.conditions):
+    if any(condition.remembers for condition in program.conditions):
         return met
     runner, allowed = ProgramRunner(program, len(met.inputs)), met.allowed.copy()
     actions = runner.act(met.inputs) - program.action.start
@@ -286,7 +286,7 @@ def _relabelled(met: Situations, n_known: int, program: ProgramData, planner: bo
 
 def _wrong(program: ProgramData, situations: Situations) -> NDArray[np.bool_]:
     """Return in which situations a program chooses what it may not; those that depend on memory are left out."""
-    if any(condition.cell != "affine" for condition in program.conditions):
+    if any(condition.remembers for condition in program.conditions):
         return np.zeros(len(situations.inputs), dtype=bool)
     actions = ProgramRunner(program, len(situations.inputs)).act(situations.inputs) - program.action.start
     wrong = ~situations.allowed[np.arange(len(actions)), actions]

@@ -44,7 +44,7 @@ class _Collector:
 
     def __init__(self, program: ProgramData, planner: bool) -> None:
         self.planner, self.n_actions = planner, program.action.n_outputs
-        self.remembers = any(condition.cell != "affine" for condition in program.conditions)
+        self.remembers = any(condition.remembers for condition in program.conditions)
         self.found: dict[tuple[bytes, int], NDArray[np.bool_]] = {}
         self.branches: list[int] = []
         self.inputs: list[NDArray[np.float64]] = []

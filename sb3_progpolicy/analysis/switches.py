@@ -66,7 +66,7 @@ def replace_switches(
     :param max_weight: largest size of a number
     :param seed: of the environments
     """
-    if all(condition.cell == "affine" for condition in program.conditions):
+    if not any(condition.remembers for condition in program.conditions):
         return Switched(program)
     traces = [_trace(program, env_id, variation, episodes, seed + k) for k, variation in enumerate(variations)]
     values = [_condition_values(program, trace) for trace in traces]
@@ -74,7 +74,7 @@ def replace_switches(
     bounds: dict[int, int] = {}
     conditions = list(program.conditions)
     for index, condition in enumerate(conditions):
-        if condition.cell == "affine":
+        if not condition.remembers:
             continue
         decisions = [value[..., index] >= 0 for value in values]
         found = None

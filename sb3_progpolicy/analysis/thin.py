@@ -38,8 +38,8 @@ class Thinner:
     """Programs of the most important numbers of another one.
 
     Importance is how much a number moves the outputs of its rule in the states that the rule decides. What a number
-    that goes has said on average is added to the constant. Branches that never act are dropped; constants and
-    conditions with a memory stay.
+    that goes has said on average is added to the constant. Branches that never act are dropped; constants stay, and so
+    do conditions with a memory or of several sums.
 
     :param program: the original
     :param states: that it meets on its way

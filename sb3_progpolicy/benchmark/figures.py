@@ -21,8 +21,9 @@ STYLES = ("-", "--", "-.", ":")
 
 def look(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Return a colour and a line style for each method, the same in all pictures of a report; the first lie on top."""
+    colours, styles = (lambda k: COLOURS[k % len(COLOURS)]), (lambda k: STYLES[k % len(STYLES)])
     return {
-        method: {"color": COLOURS[number % len(COLOURS)], "linestyle": STYLES[number % len(STYLES)], "zorder": 3 - number / 100}
+        method: {"color": colours(number), "linestyle": styles(number), "zorder": 3 - number / 100}
         for number, method in enumerate(methods)
     }
 

@@ -34,7 +34,7 @@ class Explanation:
 
     :param inputs: (name, value) of each number of X
     :param condition_values: the B of each condition, the outermost first
-    :param memory: the hidden units of each condition after the step; none for an affine one
+    :param memory: the hidden units of each condition after the step; none for one without memory
     :param branch: index of the active controller, the first whose B is not below 0
     :param mixture_weights: weight of each controller with soft semantics; ``None`` with crisp
     :param outputs: of every controller, the active one or not

@@ -139,7 +139,7 @@ class ProgramRunner:
 
     @property
     def memory(self) -> tuple[Floats, ...]:
-        """The hidden units of every condition now, ``(n_envs, hidden_size)`` each; no columns for an affine one."""
+        """The hidden units of every condition now, ``(n_envs, hidden_size)`` each; no columns without memory."""
         return tuple(cell.h for cell in self._cells)
 
     @property
@@ -210,13 +210,13 @@ class ProgramRunner:
 
 
 class _Cell:
-    """One condition: PyTorch's RNN (tanh), GRU or LSTM cell with a readout, in float64."""
+    """One condition: PyTorch's RNN (tanh), GRU or LSTM cell with a readout, a switch or affine sums, in float64."""
 
     def __init__(self, condition: Condition, n_envs: int) -> None:
         self.cell, self.size, self.n_envs = condition.cell, condition.hidden_size, n_envs
         self.readout_bias, self.readout = np.array(condition.readout_bias), np.array(condition.readout)
-        if self.cell == "affine":
-            self.rows = np.concatenate([self.readout_bias[None], self.readout])[None]
+        if not condition.remembers:
+            self.rows = np.array([[constant, *weights] for constant, weights in condition.sums], dtype=np.float64)
             return
         constant, self.hidden_bias = np.array(condition.bias_ih), np.array(condition.bias_hh)
         # Only the GRU's candidate keeps its recurrent part apart: r scales W_hn h + b_hn and nothing else.
@@ -236,8 +236,8 @@ class _Cell:
 
     def step(self, gates: Floats) -> Floats:
         """Advance the state by the gates' share of X ``(n_envs, n_rows)`` and return B ``(n_envs,)``."""
-        if self.cell == "affine":
-            return gates[:, 0]
+        if self.size == 0:
+            return np.asarray(gates.min(axis=1))
         joined = _accumulate(gates, self.joined_columns, self.h)
         apart = _accumulate(self.hidden_bias, self.apart_columns, self.h)
         self.h, self.c = STEPS[self.cell](joined, apart, self.h, self.c, _tanh)

@@ -10,13 +10,17 @@ from sb3_progpolicy.spaces import ActionSpec
 
 Vector = tuple[float, ...]
 Matrix = tuple[Vector, ...]
-Cell = Literal["affine", "rnn", "gru", "lstm", "switch"]
+Cell = Literal["affine", "min", "rnn", "gru", "lstm", "switch"]
 BoxSemantics = Literal["means", "branches"]
 BOX_SEMANTICS: tuple[BoxSemantics, ...] = ("means", "branches")
+
+#: Cells whose B is a function of X alone.
+STATELESS: tuple[Cell, ...] = ("affine", "min")
 
 #: Gates stacked in the rows of a recurrent cell's weights, in PyTorch's order.
 GATES: dict[Cell, tuple[str, ...]] = {
     "affine": (),
+    "min": (),
     "rnn": ("h",),
     "gru": ("r", "z", "n"),
     "lstm": ("i", "f", "g", "o"),
@@ -40,18 +44,21 @@ class Controller:
 class Condition:
     """The test ``B ::= RNN(X) >= 0`` (figure 1): a recurrent cell with a state of its own and an affine readout.
 
-    One step is ``h = cell(x, h)``, then ``B = readout · h + readout_bias``. For the cell ``"affine"`` there is no
-    state and ``B = readout · x + readout_bias``. A unit of the cell ``"switch"`` is 1 from the step on in which its sum
-    *on* is not below 0, and 0 from the step on in which *off* is not and *on* is; else it stays as it was. It has no
-    gradient, so that it is not trained but found (:func:`~sb3_progpolicy.simplify`) or written by hand.
+    One step is ``h = cell(x, h)``, then ``B = readout · h + readout_bias``. Two cells have no state: for ``"affine"``,
+    ``B = readout · x + readout_bias``; for ``"min"``, B is the least of the sums ``weight_ih · x + bias_ih``, so that
+    it holds where each of them is not below 0. A unit of the cell ``"switch"`` is 1 from the step on in which its sum
+    *on* is not below 0, and 0 from the step on in which *off* is not and *on* is; else it stays as it was. ``"min"``
+    and ``"switch"`` are not trained by gradient but found (:func:`~sb3_progpolicy.imitate`,
+    :func:`~sb3_progpolicy.simplify`) or written by hand.
 
-    :param cell: ``"rnn"`` (tanh), ``"gru"``, ``"lstm"`` with PyTorch's equations, ``"switch"``, or ``"affine"``
-    :param weight_ih: ``(n_gates * hidden_size, n_inputs)``, gates stacked in PyTorch's order; empty for ``"affine"``
-    :param weight_hh: ``(n_gates * hidden_size, hidden_size)``
-    :param bias_ih: ``(n_gates * hidden_size,)``
+    :param cell: ``"rnn"`` (tanh), ``"gru"``, ``"lstm"`` with PyTorch's equations, ``"switch"``, ``"affine"``, ``"min"``
+    :param weight_ih: ``(n_gates * hidden_size, n_inputs)``, gates stacked in PyTorch's order; empty for ``"affine"``, a
+        row for each sum of ``"min"``
+    :param weight_hh: ``(n_gates * hidden_size, hidden_size)``; empty without a state
+    :param bias_ih: ``(n_gates * hidden_size,)``, or one for each sum of ``"min"``
     :param bias_hh: ``(n_gates * hidden_size,)``
-    :param readout: ``(hidden_size,)``, or ``(n_inputs,)`` for ``"affine"``
-    :param readout_bias: one number
+    :param readout: ``(hidden_size,)``, or ``(n_inputs,)`` for ``"affine"``; empty for ``"min"``
+    :param readout_bias: one number; 0 for ``"min"``
     """
 
     cell: Cell
@@ -64,8 +71,20 @@ class Condition:
 
     @property
     def hidden_size(self) -> int:
-        """Number of hidden units; 0 for an affine condition."""
+        """Number of hidden units; 0 for a condition without a state."""
         return 0 if self.cell == "affine" else len(self.readout)
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the condition has a state, so that B depends on earlier steps."""
+        return self.cell not in STATELESS
+
+    @property
+    def sums(self) -> tuple[tuple[float, Vector], ...]:
+        """Constant and weights of each affine sum over X whose least one is B; none of a condition with a state."""
+        if self.cell == "affine":
+            return ((self.readout_bias, self.readout),)
+        return tuple(zip(self.bias_ih, self.weight_ih, strict=True)) if self.cell == "min" else ()
 
 
 @dataclass(frozen=True)
@@ -124,5 +143,5 @@ def inputs_read(program: ProgramData) -> set[int]:
     """Return the indices of the inputs that a program reads: those with a weight that is not zero."""
     rows = [row for controller in program.controllers for row in controller.weights]
     for condition in program.conditions:
-        rows += [condition.readout] if condition.cell == "affine" else condition.weight_ih
+        rows += [weights for _, weights in condition.sums] or condition.weight_ih
     return {index for row in rows for index, weight in enumerate(row) if weight}

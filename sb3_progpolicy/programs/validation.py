@@ -94,8 +94,11 @@ def _check_condition(path: str, condition: Condition, n_inputs: int) -> None:
     if condition.cell not in tuple(GATES):
         raise ValueError(f"{path}.cell={_short(condition.cell)} is not accepted; it is one of {', '.join(GATES)}")
     n_hidden = condition.hidden_size
-    if condition.cell != "affine" and n_hidden == 0:
+    if condition.remembers and n_hidden == 0:
         raise ValueError(f"{path}.readout: 0 hidden units given; a recurrent cell has at least 1")
+    if condition.cell == "min":
+        _check_min(path, condition, n_inputs)
+        return
     n_rows = n_hidden * len(GATES[condition.cell])
     _check_matrix(f"{path}.weight_ih", condition.weight_ih, n_rows, n_inputs)
     _check_matrix(f"{path}.weight_hh", condition.weight_hh, n_rows, n_hidden)
@@ -103,6 +106,18 @@ def _check_condition(path: str, condition: Condition, n_inputs: int) -> None:
     _check_vector(f"{path}.bias_hh", condition.bias_hh, n_rows)
     _check_vector(f"{path}.readout", condition.readout, n_hidden or n_inputs)
     _check_vector(f"{path}.readout_bias", (condition.readout_bias,), 1)
+
+
+def _check_min(path: str, condition: Condition, n_inputs: int) -> None:
+    """Check the least of some sums."""
+    if not isinstance(condition.bias_ih, tuple) or not condition.bias_ih:
+        raise ValueError(f"{path}.bias_ih: {_count(condition.bias_ih, 'sums')} given; 'min' has at least 1")
+    _check_vector(f"{path}.bias_ih", condition.bias_ih, len(condition.bias_ih))
+    _check_matrix(f"{path}.weight_ih", condition.weight_ih, len(condition.bias_ih), n_inputs)
+    for name in ("weight_hh", "bias_hh", "readout"):
+        _check_vector(f"{path}.{name}", getattr(condition, name), 0)
+    if condition.readout_bias != 0:
+        raise ValueError(f"{path}.readout_bias={_short(condition.readout_bias)} is not accepted; of 'min' it is 0")
 
 
 def _count_numbers(program: ProgramData) -> int:

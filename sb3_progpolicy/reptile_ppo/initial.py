@@ -43,8 +43,9 @@ def read_initial_program(given: ProgramData | str | os.PathLike[str] | None) -> 
             raise ValueError("init_program: a condition inside a then-branch is not accepted; those in else are")
     try:
         check_program(program)
-        if any(condition.cell == "switch" for condition in program.conditions):
-            raise ValueError("a switch has no gradient, so that training cannot start from it")
+        for cell, why in (("switch", "a switch has no gradient"), ("min", "a min of several sums is not trained")):
+            if any(condition.cell == cell for condition in program.conditions):
+                raise ValueError(f"{why}, so that training cannot start from it")
         shape_of(program)
     except ValueError as error:
         raise ValueError(f"init_program: {error}") from None

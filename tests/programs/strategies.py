@@ -30,6 +30,8 @@ def matrix(rng: np.random.Generator, rows: int, columns: int) -> Matrix:
 def condition(rng: np.random.Generator, cell: Cell, n_inputs: int, hidden_size: int) -> Condition:
     if cell == "affine":
         return Condition(cell, (), (), (), (), vector(rng, n_inputs), vector(rng, 1)[0])
+    if cell == "min":
+        return Condition(cell, matrix(rng, hidden_size, n_inputs), (), vector(rng, hidden_size), (), (), 0.0)
     rows = len(GATES[cell]) * hidden_size
     return Condition(
         cell,

@@ -11,6 +11,7 @@ import pytest
 from sb3_progpolicy import load_pretrained, pretrained_names
 from sb3_progpolicy.programs import ProgramRunner, export_onnx
 from sb3_progpolicy.programs.interpreter import _distribution
+from sb3_progpolicy.programs.syntax import STATELESS
 from tests.programs.hostile import with_hostile_texts
 from tests.programs.strategies import CELLS, KINDS, build_program, hanoi_program, small_program
 
@@ -31,7 +32,7 @@ def memory(runner):
     """The runner's memory by the names of the model's inputs."""
     held = {}
     for index, cell in enumerate(runner._cells, start=1):
-        if cell.cell != "affine":
+        if cell.cell not in STATELESS:
             held[f"h{index}"] = cell.h
         if cell.cell == "lstm":
             held[f"c{index}"] = cell.c

@@ -90,7 +90,7 @@ def test_exported_javascript_chooses_as_the_runner_on_ten_thousand_states(name):
     steps, chosen, margins = play(program, env_id, 10_000)
     (actions,) = run_node(RUN, [{"source": export_javascript(program), "steps": steps}])
     assert len(actions) >= 10_000
-    recurrent = any(condition.cell != "affine" for condition in program.conditions)
+    recurrent = any(condition.remembers for condition in program.conditions)
     for action, expected, margin in zip(actions, chosen, margins, strict=True):
         assert action == expected or (recurrent and margin < NARROW)
 

@@ -31,7 +31,7 @@ class ChartsView {
     conditions.forEach(({ cell, readout }, index) => {
       const [name, values] = [`B${index + 1}`, steps.map((step) => step.conditionValues[index])];
       charts.push(this.lines(`Condition ${name}`, [name], [values]));
-      if (cell === "affine") return;
+      if (cell === "affine" || cell === "min") return;
       const units = readout.map((_, unit) => steps.map((step) => step.memory[index][unit]));
       charts.push(this.lines(`Memory of ${name}`, units.map((_, unit) => `h${unit + 1}`), units));
     });

@@ -87,8 +87,8 @@ class ProgramView {
     const look = conditions.length ? "spine" : "spine alone";
     const spine = make("ol", { class: look, "aria-label": "Program" }, this.branches);
     const sums = [...controllers.flatMap(({ weights }) => weights), ...conditions.map(({ readout }) => readout)];
-    const switches = conditions.filter(({ cell }) => cell === "switch").flatMap(({ weightIh }) => weightIh);
-    const hides = [...sums, ...switches].some(
+    const shown = conditions.filter(({ cell }) => ["min", "switch"].includes(cell)).flatMap(({ weightIh }) => weightIh);
+    const hides = [...sums, ...shown].some(
       (row) => apart(row, this.grids).left.filter((weight) => weight !== 0).length > FEW_TERMS
     );
     const toggle = () => {
@@ -118,7 +118,11 @@ class ProgramView {
   }
 
   condition(condition) {
-    const { cell, readoutBias, readout } = condition;
+    const { cell, readoutBias, readout, weightIh, biasIh } = condition;
+    if (cell === "min") {
+      const sums = weightIh.map((row, i) => formula(biasIh[i], row, this.program.inputNames, this.most(), this.grids));
+      return ["the least of", ...sums.map((sum) => make("div", { class: "sum" }, sum))];
+    }
     if (isSwitch(condition)) return `${brief(readoutBias + readout[0])} while on, ${brief(readoutBias)} while off`;
     const units = readout.map((_, unit) => `h${unit + 1}`);
     if (cell !== "affine") return formula(readoutBias, readout, units, this.most());
@@ -139,7 +143,7 @@ class ProgramView {
   }
 
   listens({ cell, readout }, index) {
-    if (cell === "affine") return null;
+    if (cell === "affine" || cell === "min") return null;
     const condition = this.program.conditions[index];
     if (isSwitch(condition)) return this.switches(condition);
     const sizes = this.importance[index].map((size, i) => [size, this.program.inputNames[i]]);

@@ -97,7 +97,13 @@ class ReasonsView {
       return { ...sum, name: program.outputNames[thing], values: inputs, names: program.inputNames };
     }
     const index = Number(thing.slice(1)) - 1;
-    const { cell, readout, readoutBias } = program.conditions[index];
+    const { cell, readout, readoutBias, weightIh, biasIh } = program.conditions[index];
+    if (cell === "min") {
+      const totals = weightIh.map((row, i) => row.reduce((sum, weight, j) => sum + weight * inputs[j], biasIh[i]));
+      const least = totals.indexOf(Math.min(...totals)); // this sum is B
+      const sum = { name: thing, total: totals[least], constant: biasIh[least], weights: weightIh[least] };
+      return { ...sum, values: inputs, names: program.inputNames };
+    }
     const sum = { name: thing, total: conditionValues[index], constant: readoutBias, weights: readout };
     if (cell === "affine") return { ...sum, values: inputs, names: program.inputNames };
     return { ...sum, values: memory[index], names: readout.map((_, unit) => `memory h${unit + 1}`) };

@@ -23,6 +23,7 @@ _UNSAFE = re.compile(r"[^ -~]|\\|\?(?=\?)|\*(?=/)|/(?=\*)")
 # One step of each cell for unit k, from the sums of its gates; `u` is what the reset gate of a GRU scales.
 _STEPS: dict[Cell, tuple[str, ...]] = {
     "affine": (),
+    "min": (),
     "rnn": ("h[k] = tanh(a[k]);",),
     "gru": (
         "r[k] = 0.5 + 0.5 * tanh(0.5 * r[k]);",
@@ -151,7 +152,7 @@ class _CPrinter(ProgramVisitor[list[str]]):
         members = [
             (f"{kind}{index}", condition.hidden_size)
             for index, condition in enumerate(self.program.conditions, start=1)
-            for kind in {"affine": "", "lstm": "hc"}.get(condition.cell, "h")
+            for kind in ("hc" if condition.cell == "lstm" else "h" * condition.remembers)
         ]
         fields = [f"double {member}[{size}];" for member, size in members]
         zeros = [f"for (int k = 0; k < {size}; k++) state->{member}[k] = 0.0;" for member, size in members]
@@ -218,6 +219,15 @@ class _CPrinter(ProgramVisitor[list[str]]):
     def _condition(self, condition: Condition, index: int) -> list[str]:
         if condition.cell == "affine":
             return self._sum(f"double b{index}", condition.readout_bias, condition.readout, self.inputs)
+        if condition.cell == "min":
+            lines = [f"double m[{len(condition.sums)}];"]
+            for place, (bias, weights) in enumerate(condition.sums):
+                lines += self._sum(f"m[{place}]", bias, weights, self.inputs)
+            lines += [f"b{index} = m[0];"]
+            lines += [f"for (int k = 1; k < {len(condition.sums)}; k++) if (m[k] < b{index}) b{index} = m[k];"] * (
+                len(condition.sums) > 1
+            )
+            return [f"double b{index};", "{", *_indented(lines), "}"]
         size = condition.hidden_size
         gates = ("a",) if condition.cell == "rnn" else GATES[condition.cell]
         locals_ = ", ".join(f"{gate}[{size}]" for gate in (*gates, *("u" * (condition.cell == "gru"))))
@@ -356,8 +366,8 @@ def _plus(name: str, number: int) -> str:
 
 
 def _condition_words(condition: Condition) -> str:
-    if condition.cell == "affine":
-        return "affine, no memory"
+    if not condition.remembers:
+        return "affine, no memory" if condition.cell == "affine" else "the least of affine sums, no memory"
     return counted(condition.hidden_size, f"{CELL_NAMES[condition.cell]} unit")
 
 

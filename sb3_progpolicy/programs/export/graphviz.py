@@ -83,10 +83,11 @@ class _DotPrinter(ProgramVisitor[list[str]]):
         return [f'  C{index + 1} [fillcolor="#e3f0f7", label={_quote(*lines, end="l")}];']
 
     def _condition(self, condition: Condition, index: int) -> list[str]:
-        if condition.cell == "affine":
+        if not condition.remembers:
             return [
                 f"B{index + 1} >= 0 ?",
-                self._inputs_sum(condition.readout_bias, condition.readout),
+                *([f"B{index + 1} is the least of"] * (condition.cell == "min")),
+                *(self._inputs_sum(constant, weights) for constant, weights in condition.sums),
                 *map(_apart, self.tables.new_lines()),
             ]
         if is_switch(condition):

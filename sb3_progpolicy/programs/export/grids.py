@@ -177,6 +177,6 @@ def terms_to_show(program: ProgramData, max_terms: MaxTerms) -> int | None:
         return max_terms
     blocks = blocks_of(program)
     rows = [row for controller in program.controllers for row in controller.weights]
-    rows += [condition.readout for condition in program.conditions if condition.cell == "affine"]
+    rows += [weights for condition in program.conditions for _, weights in condition.sums]
     counts = [sum(map(bool, collapse(blocks, row, program.input_names, Tables())[0])) for row in rows]
     return None if max(counts, default=0) <= FEW_TERMS else MOST_TERMS

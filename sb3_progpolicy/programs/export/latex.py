@@ -102,7 +102,7 @@ class _LatexPrinter(ProgramVisitor[list[str]]):
             for name, row in zip(program.output_names, controller.weights, strict=True)
         ]
         for index, condition in enumerate(program.conditions, start=1):
-            rows = {"affine": (condition.readout,), "switch": condition.weight_ih}.get(condition.cell, ())
+            rows = condition.weight_ih if condition.cell == "switch" else [weights for _, weights in condition.sums]
             sums += [(f"B_{{{index}}}", row) for row in rows]
         for block in blocks_of(program):
             for where, weights in sums:
@@ -121,6 +121,9 @@ class _LatexPrinter(ProgramVisitor[list[str]]):
         return [rf"{_affine(index)} & \text{{{'otherwise' if index else 'always'}}}"]
 
     def _condition(self, condition: Condition, index: int) -> list[str]:
+        if condition.cell == "min":
+            weights, constants = self._matrix(condition.weight_ih), self._vector(condition.bias_ih)
+            return [rf"B_{{{index}}}(x) &= \min \left[ {constants} + {weights} x \right]"]
         readout = self._matrix((condition.readout,))
         constant = self.number(condition.readout_bias)
         if condition.cell == "affine":

@@ -105,6 +105,9 @@ class _Graph:
         """Advance a condition and return its B, ``(n_envs, 1)``."""
         if condition.cell == "affine":
             return self._affine("x", (condition.readout,), (condition.readout_bias,))
+        if condition.cell == "min":
+            sums = self._affine("x", condition.weight_ih, condition.bias_ih)
+            return self._node("ReduceMin", sums, axes=[1], keepdims=1)
         size, n_inputs = condition.hidden_size, self.program.n_inputs
         memory = {f"{kind}{k}": f"{kind}{k}_next" for kind in ("hc" if condition.cell == "lstm" else "h")}
         self.inputs += [self._value(name, np.float64, size) for name in memory]

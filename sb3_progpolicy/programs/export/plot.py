@@ -139,6 +139,10 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
         inputs = self.program.input_names
         if is_switch(condition):
             return self._switch(condition, index)
+        if condition.cell == "min":
+            sums = [self._terms(constant, *self._collapsed(weights)) for constant, weights in condition.sums]
+            least = ((f"B{index + 1} is the least of", QUIET, 0),)
+            return _Card((_head(index), least, *(_in_a_row(*one) for one in sums), *self._new_tables()))
         if condition.cell == "affine":
             readout, names = self._collapsed(condition.readout)
             constant, terms = self._terms(condition.readout_bias, readout, names)

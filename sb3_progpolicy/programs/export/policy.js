@@ -73,6 +73,9 @@ class ProgramPolicy {
     if (condition.cell === "affine") {
       return accumulate(condition.readoutBias, condition.readout, inputs);
     }
+    if (condition.cell === "min") {
+      return Math.min(...condition.weightIh.map((row, i) => accumulate(condition.biasIh[i], row, inputs)));
+    }
     const size = condition.readout.length;
     const old = this.hidden[index];
     const separate = condition.cell === "gru" ? 2 * size : Infinity; // the GRU scales the recurrent part of n alone

@@ -96,14 +96,20 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
         ]
 
     def _test(self, word: str, condition: Condition, index: int) -> list[str]:
-        if not self.by_hand or condition.cell != "affine":
+        if not self.by_hand or condition.remembers:
             return [f"{word} b{index} >= 0.0:"]
-        terms = zip(condition.readout, self._variables(), strict=True)
-        tokens = sum_tokens(number(condition.readout_bias), [term for term in terms if term[0]])
-        line = f"{word} {' '.join(tokens)} >= 0:"
-        return (
-            [line] if len(line) <= WIDTH - 10 else [f"{word} (", *pack(tokens, "    ", "    ", WIDTH - 12), ") >= 0:"]
-        )
+        sums = []
+        for constant, weights in condition.sums:
+            terms = zip(weights, self._variables(), strict=True)
+            sums.append(sum_tokens(number(constant), [term for term in terms if term[0]]))
+        line = f"{word} {' and '.join(' '.join([*tokens, '>= 0']) for tokens in sums)}:"
+        if len(line) <= WIDTH - 10:
+            return [line]
+        if len(sums) == 1:
+            return [f"{word} (", *pack(sums[0], "    ", "    ", WIDTH - 12), ") >= 0:"]
+        tests = [pack([*tokens, ">= 0"], "    and ", "        ", WIDTH - 12) for tokens in sums]
+        tests[0][0] = tests[0][0].replace("and ", "    ", 1)
+        return [f"{word} (", *(part for test in tests for part in test), "):"]
 
     def visit_controller(self, controller: Controller, index: int) -> list[str]:
         lines = self._controller(controller, index)
@@ -121,7 +127,7 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
             "#     action = policy.act(observation, action, reward, done)  # every later step",
             *(
                 ["", "from math import tanh"]
-                if any(c.cell not in ("affine", "switch") for c in self.program.conditions)
+                if any(c.remembers and c.cell != "switch" for c in self.program.conditions)
                 else []
             ),
             "",
@@ -169,7 +175,7 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
         """Every state variable with the local names of its numbers."""
         states = []
         for index, condition in enumerate(self.program.conditions, start=1):
-            kinds = {"affine": "", "lstm": "hc"}.get(condition.cell, "h")
+            kinds = "hc" if condition.cell == "lstm" else "h" * condition.remembers
             states += [
                 (f"{kind}{index}", [f"{kind}{index}_{u + 1}" for u in range(condition.hidden_size)]) for kind in kinds
             ]
@@ -234,7 +240,7 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
     def _advance_conditions(self) -> list[str]:
         lines = [f"{tuple_of(names)} = self._{name}" for name, names in self._states()]
         for index, condition in enumerate(self.program.conditions, start=1):
-            if self.by_hand and condition.cell == "affine":
+            if self.by_hand and not condition.remembers:
                 continue
             lines += ["", f"# Condition {index}: {condition_words(condition)}", *self._condition(condition, index)]
         return [*lines, ""]
@@ -242,6 +248,10 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
     def _condition(self, condition: Condition, index: int) -> list[str]:
         if condition.cell == "affine":
             return self._affine([_Row(f"b{index}", condition.readout_bias, condition.readout)], f"CONDITION_{index}")
+        if condition.cell == "min":
+            sums = [_Row(f"m{index}_{place}", *one) for place, one in enumerate(condition.sums, start=1)]
+            least = pack(separated(row.name for row in sums), f"b{index} = min((", "    ", WIDTH - 12)
+            return [*self._affine(sums, f"CONDITION_{index}"), *least[:-1], f"{least[-1]}))"]
         hidden = [f"h{index}_{unit + 1}" for unit in range(condition.hidden_size)]
         gates = [f"{gate}{index}_{unit + 1}" for gate, unit in gate_names(condition)]
         if condition.cell == "rnn":
@@ -368,7 +378,7 @@ def _weights_of_inputs(program: ProgramData) -> list[Sequence[float]]:
     """The weights of X in every sum of a program."""
     rows: list[Sequence[float]] = [row for controller in program.controllers for row in controller.weights]
     for condition in program.conditions:
-        rows += [condition.readout] if condition.cell == "affine" else condition.weight_ih
+        rows += [weights for _, weights in condition.sums] or condition.weight_ih
     return rows
 
 

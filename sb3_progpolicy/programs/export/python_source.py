@@ -16,7 +16,7 @@ _MAX_IDENTIFIER = 40
 _TAKEN = {"self", "observation", "previous_action", "previous_reward", "previous_done", "reward", "done", "action"}
 _TAKEN |= {"scores", "tanh", "float", "int", "len", "max", "min", "map", *keyword.kwlist}
 # The local variables of the written method: one of these letters or words, then numbers.
-_OURS = re.compile(r"((new_)?[bhcrznifgoup]|on|off|scores|given|action)(_?[0-9])+")
+_OURS = re.compile(r"((new_)?[bhcrznifgoupm]|on|off|scores|given|action)(_?[0-9])+")
 
 
 class Identifiers:
@@ -87,8 +87,8 @@ def cell_statements(cell: str, unit: str) -> Iterator[str]:
 
 def condition_words(condition: Condition) -> str:
     """What a condition remembers, for a comment."""
-    if condition.cell == "affine":
-        return "affine, no memory"
+    if not condition.remembers:
+        return "affine, no memory" if condition.cell == "affine" else "the least of affine sums, no memory"
     words = {
         "rnn": "h = tanh(...)",
         "gru": "reset r, update z, candidate n, memory h",

@@ -37,8 +37,8 @@ def export_text(program: ProgramData, decimals: int = 2, max_terms: int | None =
     """Print a program as an indented if-then-else that a person can read.
 
     The terms of every sum stand in order of size. Those that round to zero or come after ``max_terms`` are only
-    counted. An affine condition stands in the line of its branch, and several numbers of a Box action in one line,
-    where they fit. Whole numbers are printed without a point, so that ``3`` is exact and ``3.00`` is rounded.
+    counted. A condition without memory stands in the line of its branch, and several numbers of a Box action in one
+    line, where they fit. Whole numbers are printed without a point, so that ``3`` is exact and ``3.00`` is rounded.
     :func:`export_python` and the saved file hold all numbers in full.
 
     :param program: what to print
@@ -73,8 +73,8 @@ class _TextPrinter(ProgramVisitor[list[str]]):
         return "\n".join(lines) + "\n"
 
     def visit_branch(self, branch: IfThenElse, index: int) -> list[str]:
-        heading = self._inline(branch.condition, index) or f"{_word(index)} B{index + 1} >= 0:"
-        return [heading, *self._lines(branch.then), *self.visit(branch.orelse, index + 1)]
+        heading = self._inline(branch.condition, index) or [f"{_word(index)} B{index + 1} >= 0:"]
+        return [*heading, *self._lines(branch.then), *self.visit(branch.orelse, index + 1)]
 
     def visit_controller(self, controller: Controller, index: int) -> list[str]:
         return ["else:" if index else "always:", *self._lines(controller)]
@@ -93,6 +93,10 @@ class _TextPrinter(ProgramVisitor[list[str]]):
             *(
                 ["The first B from the top that is not below 0 decides; all are computed at every step."]
                 * (n_conditions > 1)
+            ),
+            *(
+                ["A min is not below 0 where all of its sums are not."]
+                * any(condition.cell == "min" for condition in program.conditions)
             ),
         ]
 
@@ -115,14 +119,29 @@ class _TextPrinter(ProgramVisitor[list[str]]):
                 lines += added
         return lines
 
-    def _inline(self, condition: Condition, index: int) -> str | None:
-        """Return the line that begins a branch with its condition written out, if it is affine and fits."""
-        if condition.cell != "affine":
+    def _inline(self, condition: Condition, index: int) -> list[str] | None:
+        """Return the lines that begin a branch with its condition written out: a min, or an affine one that fits."""
+        if condition.remembers:
             return None
-        start = f"{_word(index)} "
-        lines = self._inputs_sum(f"{start}B{index + 1} = ", condition.readout_bias, condition.readout)
-        heading = f"{lines[0]} >= 0:"
-        return heading if len(lines) == 1 and len(heading) <= WIDTH else None
+        lines = self._stateless(condition, f"{_word(index)} B{index + 1} = ", " >= 0:")
+        fits = len(lines) == 1 and len(lines[0]) <= WIDTH
+        return lines if fits or condition.cell == "min" else None
+
+    def _stateless(self, condition: Condition, start: str, close: str = "") -> list[str]:
+        """An affine sum, or the least of several."""
+        if condition.cell == "affine":
+            ((constant, weights),) = condition.sums
+            return self._inputs_sum(start, constant, weights, close)
+        first = f"{start}min("
+        following, ends = " " * len(first), [*[","] * (len(condition.sums) - 1), f"){close}"]
+        sums = [
+            self._inputs_sum(following, constant, weights, end)
+            for (constant, weights), end in zip(condition.sums, ends, strict=True)
+        ]
+        if all(len(lines) == 1 for lines in sums):
+            return pack([lines[0][len(first) :] for lines in sums], first, following, WIDTH)
+        lines = [line for of_one in sums for line in of_one]
+        return [first + lines[0][len(first) :], *lines[1:]]
 
     def _inputs_sum(self, start: str, constant: float, weights: Sequence[float], close: str = "") -> list[str]:
         """A sum over X, its grids as functions of row and column or as tables where they are such."""
@@ -137,8 +156,8 @@ class _TextPrinter(ProgramVisitor[list[str]]):
     def _condition(self, condition: Condition, index: int) -> list[str]:
         size = condition.hidden_size
         start = f"B{index + 1} = "
-        if condition.cell == "affine":
-            return self._inputs_sum(start, condition.readout_bias, condition.readout)
+        if not condition.remembers:
+            return self._stateless(condition, start)
         if is_switch(condition):
             while_on, while_off = condition.readout_bias + condition.readout[0], condition.readout_bias
             lines = [f"{start}{self.number(while_on)} while on, {self.number(while_off)} while off"]

@@ -16,7 +16,7 @@ from sb3_progpolicy.spaces import ActionSpec
 
 Result = TypeVar("Result")
 
-CELL_NAMES = {"affine": "affine", "rnn": "RNN", "gru": "GRU", "lstm": "LSTM", "switch": "switch"}
+CELL_NAMES = {"affine": "affine", "min": "min", "rnn": "RNN", "gru": "GRU", "lstm": "LSTM", "switch": "switch"}
 
 
 class ProgramVisitor(ABC, Generic[Result]):
@@ -107,8 +107,8 @@ def input_importance(condition: Condition) -> tuple[float, ...]:
     """How much each number of X can move a condition: its absolute weights into the units, each times the absolute
     weight of that unit in B, summed.
     """
-    if condition.cell == "affine":
-        return tuple(abs(weight) for weight in condition.readout)
+    if not condition.remembers:
+        return tuple(sum(map(abs, column)) for column in zip(*(weights for _, weights in condition.sums), strict=True))
     size = condition.hidden_size
     return tuple(
         sum(abs(weight * condition.readout[row % size]) for row, weight in enumerate(column))

@@ -1,0 +1,108 @@
+"""Conditions that are the least of several sums: they hold where all of them are not below 0."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sb3_progpolicy import ReptilePPO
+from sb3_progpolicy.programs import (
+    ActionSpec,
+    Condition,
+    Controller,
+    IfThenElse,
+    Program,
+    ProgramRunner,
+    check_program,
+    export_graphviz,
+    export_latex,
+    export_python,
+    export_text,
+    plot_program,
+)
+from sb3_progpolicy.programs.transform import fold_normalization
+
+NEAR_AND_LOW = Condition("min", ((-1.0, 0.0), (0.0, -2.0)), (), (0.5, 1.0), (), (), 0.0)
+
+
+def grip(condition=NEAR_AND_LOW):
+    """Close the hand where it is near and low, else go on."""
+    stay, go = Controller(((0.0, 0.0),), (0.0,)), Controller(((1.0, 0.0),), (0.0,))
+    action = ActionSpec("box", (1,), (-1.0,), (1.0,))
+    return Program(IfThenElse(condition, stay, go), 2, action, False, ("distance", "height"), ("move",))
+
+
+def test_min_holds_where_all_of_its_sums_do():
+    runner = ProgramRunner(grip(), 4)
+    runner.act([[0.5, 0.5], [0.6, 0.0], [0.0, 0.6], [0.0, 0.0]])
+    np.testing.assert_allclose(runner.condition_values[:, 0], [0.0, -0.1, -0.2, 0.5])
+    assert runner.branch.tolist() == [0, 1, 1, 0]
+    assert runner.memory[0].shape == (4, 0)
+    assert not NEAR_AND_LOW.remembers
+
+
+def test_min_is_printed_as_what_it_is():
+    text = export_text(grip())
+    assert "if B1 = min(0.50 - distance, 1 - 2*height) >= 0:" in text
+    assert "A min is not below 0 where all of its sums are not." in text
+    assert "All memory" not in text
+    assert "if 0.5 - distance >= 0 and 1 - 2 * height >= 0:" in export_python(grip())
+    assert "B1 is the least of" in export_graphviz(grip())
+    assert r"\min" in export_latex(grip())
+    written = [text.get_text() for text in plot_program(grip()).texts]
+    assert "B1 is the least of" in written
+
+
+def test_long_min_breaks_between_its_sums():
+    names = tuple(f"a_rather_long_name_of_input_{index}" for index in range(2))
+    three = Condition("min", ((1.0, -3.5),) * 3, (), (0.25,) * 3, (), (), 0.0)
+    lines = export_text(replace(grip(three), input_names=names)).splitlines()
+    first = lines.index("if B1 = min(0.25 - 3.50*a_rather_long_name_of_input_1 + a_rather_long_name_of_input_0,")
+    assert lines[first + 1].strip() == lines[first].removeprefix("if B1 = min(")
+    assert lines[first + 2].endswith("a_rather_long_name_of_input_0) >= 0:")
+    assert max(map(len, lines[first:])) <= 100
+
+
+def test_python_of_a_long_min_runs():
+    names = tuple(f"a_rather_long_name_of_input_{index}" for index in range(2))
+    many = Condition("min", ((1.0, -3.5),) * 2 + ((-1.0, 0.25),), (), (0.25,) * 3, (), (), 0.0)
+    program = replace(grip(many), input_names=names)
+    space = {}
+    exec(compile(export_python(program), "program.py", "exec"), space)
+    policy, runner = space["ProgramPolicy"](), ProgramRunner(program)
+    for inputs in np.random.default_rng(0).uniform(-1, 1, (50, 2)):
+        assert policy.act(inputs.tolist()) == pytest.approx(runner.act(inputs[None])[0])
+
+
+def test_normalisation_is_folded_into_every_sum():
+    mean, scale = np.array([0.5, -1.0]), np.array([2.0, 0.1])
+    folded, inputs = fold_normalization(grip(), mean, scale), np.random.default_rng(0).normal(size=(20, 2))
+    runners = ProgramRunner(folded, 20), ProgramRunner(grip(), 20)
+    runners[0].act(inputs)
+    runners[1].act((inputs - mean) * scale)
+    np.testing.assert_allclose(runners[0].condition_values, runners[1].condition_values)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"bias_ih": (), "weight_ih": ()}, r"bias_ih: 0 sums given; 'min' has at least 1"),
+        ({"weight_ih": ((1.0, 0.0),)}, r"weight_ih: 1 rows given; a tuple of 2 rows is accepted"),
+        ({"weight_ih": ((1.0,), (0.0,))}, r"weight_ih\[0\]: 1 numbers given; a tuple of 2 numbers"),
+        ({"readout": (1.0, 1.0)}, r"readout: 2 numbers given; a tuple of 0 numbers"),
+        ({"readout_bias": 1.0}, r"readout_bias=1.0 is not accepted; of 'min' it is 0"),
+        ({"bias_hh": (0.0,)}, r"bias_hh: 1 numbers given"),
+    ],
+)
+def test_malformed_min_is_an_error(change, message):
+    with pytest.raises(ValueError, match=message):
+        check_program(grip(replace(NEAR_AND_LOW, **change)))
+
+
+def test_training_does_not_start_from_a_min():
+    program = replace(grip(), n_observations=3, input_names=("x", "y", "z"))
+    wide = Condition("min", ((-1.0, 0.0, 0.0),), (), (0.5,), (), (), 0.0)
+    controller = Controller(((0.0, 0.0, 0.0),), (0.0,))
+    program = replace(program, body=IfThenElse(wide, controller, controller))
+    with pytest.raises(ValueError, match="init_program: a min of several sums is not trained"):
+        ReptilePPO("PRLPolicy", "Pendulum-v1", n_envs=1, init_program=program)
