@@ -27,7 +27,9 @@ def distill(
     ] = None,
     n_timesteps: Annotated[int, typer.Option("--n-timesteps", "-n", min=1, help="states to label")] = 30_000,
     max_conditions: Annotated[int, typer.Option("--max-conditions", min=0, help="of the program at most")] = 11,
-    cell: Annotated[str, typer.Option("--cell", help="of the conditions: affine, or gru, which remembers")] = "affine",
+    cell: Annotated[
+        str, typer.Option("--cell", help="of the conditions: affine; min, several at once; gru, which remembers")
+    ] = "affine",
     seed: Annotated[int, typer.Option("--seed", min=0, help="of all draws")] = 0,
     interaction: Annotated[
         bool, typer.Option("--interaction", help="let it read its previous action, reward and done flag, too")
@@ -100,7 +102,7 @@ def _imitated(teacher: Any, env_id: str, output: Path | None, arguments: dict[st
 
     from sb3_progpolicy.imitation import imitate
 
-    keeps_state = output is not None and arguments["cell"] == "affine"
+    keeps_state = output is not None and arguments["cell"] != "gru"
     state = output.with_suffix(".state.npz") if output is not None and keeps_state else None
     with Progress(console=Console(stderr=True)) as progress:
         bar = progress.add_task(f"Imitating on {env_id}", total=None)

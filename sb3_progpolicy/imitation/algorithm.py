@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +25,13 @@ from sb3_progpolicy.imitation.tasks import names_of, training_variations, valida
 from sb3_progpolicy.imitation.teachers import Teacher, TeacherLike, make_teacher
 from sb3_progpolicy.imitation.visits import Collector
 from sb3_progpolicy.programs.program import Program
-from sb3_progpolicy.programs.syntax import Expression
+from sb3_progpolicy.programs.syntax import STATELESS, Expression
 from sb3_progpolicy.spaces import action_spec
 
 #: Share of the teacher in each round; 0 in all later ones.
 TEACHER_SHARES = (1.0, 0.6, 0.4, 0.3, 0.2, 0.1)
+#: Sums of a condition at most, if ``cell="min"``.
+MAX_SUMS = 3
 N_ROUNDS, N_PLAIN_ROUNDS, N_SPARSE_ROUNDS = 9, 10, 3
 _CHANGED = 0.02  # share of the actions, or mean distance, that rounding may change
 _DIGITS = (2, 3, 4, 6)
@@ -96,7 +98,8 @@ def imitate(
     :param tasks: variations to learn on, the easiest first; by default those that the domain is trained on
     :param n_timesteps: states to label, at most
     :param max_conditions: of the program at most
-    :param cell: of the conditions: ``"affine"``, or ``"gru"``, a memory of one unit each, where the teacher's action is
+    :param cell: of the conditions: ``"affine"``; ``"min"``, which lets conditions of a plain program ask for up to
+        three things at once, Box actions only; or ``"gru"``, a memory of one unit each, where the teacher's action is
         not a function of the present input
     :param seed: of all draws
     :param n_envs: environments that are stepped together
@@ -116,9 +119,9 @@ def imitate(
     :return: the program; its metadata say that it was learned by imitation, and of whom
     :raises ValueError: if an argument is not accepted
     """
-    if cell not in ("affine", *RECURRENT_CELLS):
-        raise ValueError(f"cell={cell!r} is not accepted; conditions of imitated programs are 'affine' or 'gru'")
-    remembers = cell != "affine"
+    if cell not in (*STATELESS, *RECURRENT_CELLS):
+        raise ValueError(f"cell={cell!r} is not accepted; conditions of imitated programs are 'affine', 'min' or 'gru'")
+    remembers = cell not in STATELESS
     if remembers and (augment is not None or checkpoint is not None or max_conditions < 1):
         raise ValueError(
             f"cell={cell!r} is not accepted with augment={augment!r}, checkpoint={str(checkpoint)!r}, "
@@ -141,7 +144,8 @@ def imitate(
     one_thread = threadpool_limits(1, user_api="blas")
     with one_thread, Pool(env_id, n_envs, env_kwargs, interaction, begin) as pool:
         tolerances = score_tolerance, plain_tolerance
-        run = _Run(pool, teacher, env_id, tasks, seed, max_conditions + 1, ignore, n_episodes, tolerances, augment)
+        settings = Settings(max_conditions + 1, seed, max_sums=MAX_SUMS if cell == "min" else 1)
+        run = _Run(pool, teacher, env_id, tasks, settings, ignore, n_episodes, tolerances, augment)
         n_states = n_timesteps // (len(SHARES) + 1 if remembers else run.n_rounds + 1)
         with Pool(env_id, run.n_rows(n_states), env_kwargs, interaction, begin) as visited:
             if remembers:
@@ -158,16 +162,17 @@ class _Run:
         teacher: TeacherLike,
         env_id: str,
         tasks: Variations | None,
-        seed: int,
-        max_branches: int,
+        settings: Settings,
         ignore: Sequence[str],
         n_episodes: int,
         tolerances: tuple[float, float],
         augment: str | Augment | None,
     ) -> None:
         env: Any = pool.envs[0]
-        self.pool, self.seed = pool, seed
+        self.pool, self.seed = pool, settings.seed
         self.spec = action_spec(env.action_space)
+        if settings.max_sums > 1 and self.spec.kind != "box":
+            raise ValueError(f"cell='min' is not accepted for {self.spec.kind} actions; for Box actions it is")
         self.inputs, self.outputs = names_of(env, self.spec.n_outputs, pool.interaction)
         self.codec = ActionCodec(self.spec, self.outputs)
         self.teacher: Teacher = make_teacher(teacher, env)
@@ -179,11 +184,11 @@ class _Run:
         score_tolerance, plain_tolerance = tolerances
         self.judge = Judge(pool, validation, n_episodes, score_tolerance, self.teacher)
         self.ranks, self.augmentation = ranks, make_augmentation(augment, self.inputs)
-        self.origin: dict[str, Any] = {"env": env_id, "seed": seed, "teacher": self.teacher.name}
+        self.origin: dict[str, Any] = {"env": env_id, "seed": self.seed, "teacher": self.teacher.name}
         if augment is not None:
             self.origin["augment"] = augment if isinstance(augment, str) else getattr(augment, "__name__", "function")
         readable = np.array([name not in ignore for name in self.inputs])
-        self.learner = Learner(self.codec, readable, Settings(max_branches, seed))
+        self.learner = Learner(self.codec, readable, settings)
         beyond = validation_variations(env_id) if tasks is None else ()
         self.selection = Selection(self.learner, self.judge, beyond, self.codec, self.augmentation, plain_tolerance)
         self.n_labelled = 0
@@ -221,6 +226,7 @@ class _Run:
             **self.origin,
             "n_steps": n_steps,
             "max_branches": self.learner.settings.max_branches,
+            "max_sums": self.learner.settings.max_sums,
             "n_episodes": self.judge.n_episodes,
             "score_tolerance": self.judge.tolerance,
             "plain_tolerance": self.selection.plain_tolerance,
@@ -353,7 +359,7 @@ class _Run:
         """Return the best list with as few digits as its episodes allow, its outputs in the unit of actions."""
         assert self.selection.best is not None
         score, best = self.selection.best
-        raw = DecisionList(best.conditions, self.codec.to_action_units(best.controllers))
+        raw = replace(best, controllers=self.codec.to_action_units(best.controllers))
         states = self.learner.observations[:: max(1, self.learner.n_states // 2000)]
         exact = self.codec.act_of(best)(states)
         for digits in _DIGITS:
@@ -370,7 +376,7 @@ class _Run:
         assert self.learner.raw is not None
         best = self.selection.best
         raw = self.learner.raw if best is None else best[1]
-        in_units = DecisionList(raw.conditions, self.codec.to_action_units(raw.controllers))
+        in_units = replace(raw, controllers=self.codec.to_action_units(raw.controllers))
         return Imitation(
             number,
             total,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -34,9 +35,14 @@ def to_program(
         for matrix in raw.controllers
     ]
     body: Expression = controllers[-1]
-    for weights, controller in reversed(list(zip(raw.conditions.tolist(), controllers[:-1], strict=True))):
-        condition = Condition("affine", (), (), (), (), tuple(weights[:-1]), weights[-1])
-        body = IfThenElse(condition, controller, body)
+    for index in reversed(range(raw.n_branches - 1)):
+        sums = raw.sums_of(index)
+        weights, constants = tuple(map(tuple, sums[:, :-1].tolist())), tuple(sums[:, -1].tolist())
+        if len(sums) == 1:
+            condition = Condition("affine", (), (), (), (), weights[0], constants[0])
+        else:
+            condition = Condition("min", weights, (), constants, (), (), 0.0)
+        body = IfThenElse(condition, controllers[index], body)
     return make_program(body, spec, input_names, output_names, interaction, **metadata)
 
 
@@ -64,7 +70,7 @@ def make_program(
 
 
 def rounded(raw: DecisionList, digits: int, unit: Floats) -> DecisionList:
-    """Return the list with numbers of so many significant digits; a condition's largest weight becomes 1.
+    """Return the list with numbers of so many significant digits; the largest weight of a condition's sum becomes 1.
 
     Constants of controllers are rounded to as many digits after the point, relative to what the controllers give.
 
@@ -76,7 +82,7 @@ def rounded(raw: DecisionList, digits: int, unit: Floats) -> DecisionList:
     conditions = raw.conditions / np.where(largest > 0, largest, 1.0)
     controllers = significant(raw.controllers, digits)
     controllers[..., -1] = significant(np.round(controllers[..., -1] / unit, digits) * unit, digits + 2)
-    return DecisionList(significant(conditions, digits), controllers)
+    return replace(raw, conditions=significant(conditions, digits), controllers=controllers)
 
 
 def significant(numbers: Floats, digits: int) -> Floats:

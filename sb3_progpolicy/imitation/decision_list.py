@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,12 +87,20 @@ class Scaler:
 class DecisionList:
     """The first condition that holds decides which controller acts; the last controller acts where none holds.
 
-    :param conditions: ``(n_branches - 1, n_inputs + 1)``; one holds where its product with the inputs is not below 0
+    A condition holds where none of its sums, products with the inputs, is below 0.
+
+    :param conditions: their sums, ``(n_sums, n_inputs + 1)``
     :param controllers: ``(n_branches, n_outputs, n_inputs + 1)``
+    :param owners: of which condition each sum is, ascending, ``(n_sums,)``; by default each is a condition
     """
 
     conditions: Floats
     controllers: Floats
+    owners: NDArray[np.intp] = field(default=None)  # type: ignore[arg-type]
+
+    def __post_init__(self) -> None:
+        if self.owners is None:
+            object.__setattr__(self, "owners", np.arange(len(self.conditions)))
 
     @property
     def n_branches(self) -> int:
@@ -104,8 +112,18 @@ class DecisionList:
 
         :param inputs: ``(n, n_inputs + 1)``
         """
-        holds = np.column_stack([inputs @ self.conditions.T >= 0, np.ones(len(inputs), dtype=bool)])
-        return holds.argmax(axis=1)
+        holds = inputs @ self.conditions.T >= 0
+        if len(self.owners) >= self.n_branches:
+            first_sums = np.searchsorted(self.owners, np.arange(self.n_branches - 1))
+            holds = np.logical_and.reduceat(holds, first_sums, axis=1)
+        return np.column_stack([holds, np.ones(len(inputs), dtype=bool)]).argmax(axis=1)
+
+    def sums_of(self, condition: int) -> Floats:
+        """Return the sums of a condition, ``(n_sums, n_inputs + 1)``.
+
+        :param condition: its index
+        """
+        return self.conditions[self.owners == condition]
 
     def outputs(self, inputs: Floats) -> Floats:
         """Return what the acting controllers give, ``(n, n_outputs)``.
@@ -115,7 +133,7 @@ class DecisionList:
         return np.asarray(np.einsum("nd,nod->no", inputs, self.controllers[self.branches(inputs)]))
 
     def insert(self, position: int, condition: Floats, controller: Floats) -> DecisionList:
-        """Return the list with one more branch.
+        """Return the list with one more branch, if each condition is one sum.
 
         :param position: of the new branch; at most that of the last controller, which stays the last
         :param condition: ``(n_inputs + 1,)``
@@ -131,8 +149,13 @@ class DecisionList:
 
         :param index: of the controller
         """
-        condition = min(index, len(self.conditions) - 1)
-        return DecisionList(np.delete(self.conditions, condition, axis=0), np.delete(self.controllers, index, axis=0))
+        condition = min(index, self.n_branches - 2)
+        left = self.owners != condition
+        return DecisionList(
+            self.conditions[left],
+            np.delete(self.controllers, index, axis=0),
+            self.owners[left] - (self.owners[left] > condition),
+        )
 
     def moved(self, old: Scaler, new: Scaler) -> DecisionList:
         """Return the same list on inputs that are standardised otherwise.
@@ -140,7 +163,11 @@ class DecisionList:
         :param old: of this list
         :param new: of the list returned
         """
-        return DecisionList(new.from_raw(old.to_raw(self.conditions)), new.from_raw(old.to_raw(self.controllers)))
+        return replace(
+            self,
+            conditions=new.from_raw(old.to_raw(self.conditions)),
+            controllers=new.from_raw(old.to_raw(self.controllers)),
+        )
 
 
 def rest_losses(losses: Floats, holds: NDArray[np.bool_]) -> list[Floats]:

@@ -35,12 +35,14 @@ class Settings:
     :param seed: of all draws
     :param round_steps: gradient steps in each round
     :param final_steps: gradient steps at the end
+    :param max_sums: of a condition of a plain list at most
     """
 
     max_branches: int
     seed: int
     round_steps: int = 400
     final_steps: int = 1200
+    max_sums: int = 1
 
 
 class Learner:
@@ -163,18 +165,15 @@ class Learner:
             pieces = np.concatenate([pieces, own])
         if finder.explained(pieces) < _EXPLAINED:
             return []
-        ordering = Ordering(data, loss.matrix(data, pieces), self.settings.max_branches)
+        ordering = Ordering(data, loss.matrix(data, pieces), self.settings.max_branches, self.settings.max_sums)
         starts = []
         for one in present:
             distances = np.abs(one.controllers[:, None] - pieces[None]).sum(axis=(2, 3))
-            starts.append(Order(tuple(one.conditions), tuple(map(int, distances.argmin(axis=1)))))
+            conditions = tuple(map(one.sums_of, range(one.n_branches - 1)))
+            starts.append(Order(conditions, tuple(map(int, distances.argmin(axis=1)))))
         starts = [*starts[:1], *map(self._pruned, starts)]
         orders = [ordering.fit(start) for start in starts] or [ordering.fit()]
-        width = data.inputs.shape[1]
-        return [
-            _raw(DecisionList(np.array(order.conditions).reshape(-1, width), pieces[list(order.pieces)]), scaler)
-            for order in orders
-        ]
+        return [_raw(order.as_list(pieces), scaler) for order in orders]
 
     def _losing_weighted(self) -> Floats:
         """Return weights: states in which a student loses count far more, but no more than a share of all."""
@@ -207,7 +206,7 @@ class Learner:
         return scaler, Data(scaler(self.observations), self.targets, self.weights)
 
     def _scaled(self, raw: DecisionList, scaler: Scaler) -> DecisionList:
-        return DecisionList(scaler.from_raw(raw.conditions), scaler.from_raw(raw.controllers))
+        return replace(raw, conditions=scaler.from_raw(raw.conditions), controllers=scaler.from_raw(raw.controllers))
 
     def _some(self, data: Data, size: int) -> Data:
         if len(data) <= size:
@@ -243,7 +242,9 @@ class Learner:
 
 
 def _raw(program: DecisionList, scaler: Scaler) -> DecisionList:
-    return DecisionList(scaler.to_raw(program.conditions), scaler.to_raw(program.controllers))
+    return replace(
+        program, conditions=scaler.to_raw(program.conditions), controllers=scaler.to_raw(program.controllers)
+    )
 
 
 def _drawn(data: Data, size: int, rng: np.random.Generator) -> Data:

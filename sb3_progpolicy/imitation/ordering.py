@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_progpolicy.imitation.conditions import fit_condition, fit_priced_condition, refit_condition
-from sb3_progpolicy.imitation.decision_list import Data, Floats, rest_losses
+from sb3_progpolicy.imitation.conditions import fit_condition
+from sb3_progpolicy.imitation.conjunctions import ConditionFitter, holds, price_of
+from sb3_progpolicy.imitation.decision_list import Data, DecisionList, Floats, rest_losses
 
 PRICE = 0.001  # of an input of a condition, in mean loss
 _WORTH = 0.001  # mean loss that a branch has to take away beyond the price of its condition
 _MATTERS = 1e-3  # a gain, as a share of the largest weight, below which a state does not matter
+_FEWEST = 20  # states that a condition is fitted to
 _CLOSER = 6  # insertions that are looked at with few inputs, the best of those with all inputs
 
 
@@ -20,12 +22,21 @@ _CLOSER = 6  # insertions that are looked at with few inputs, the best of those 
 class Order:
     """Conditions, and which piece acts where each is the first to hold.
 
-    :param conditions: ``(width,)`` each
+    :param conditions: ``(n_sums, width)`` each; one holds where none of its sums is below 0
     :param pieces: indices, one more than conditions; the last piece acts where none holds
     """
 
     conditions: tuple[Floats, ...]
     pieces: tuple[int, ...]
+
+    def as_list(self, pieces: Floats) -> DecisionList:
+        """Return the list that it stands for.
+
+        :param pieces: ``(n_pieces, n_outputs, width)``
+        """
+        sums = np.concatenate([np.zeros((0, pieces.shape[2])), *self.conditions])
+        owners = np.repeat(np.arange(len(self.conditions)), list(map(len, self.conditions)))
+        return DecisionList(sums, pieces[list(self.pieces)], owners)
 
     def insert(self, position: int, condition: Floats, piece: int) -> Order:
         """Return the order with one more branch."""
@@ -47,10 +58,12 @@ class Ordering:
     :param data: labelled states
     :param losses: of every piece in every state, ``(n, n_pieces)``; more than 1 counts as 1
     :param most: number of branches at most
+    :param most_sums: of a condition at most
     """
 
-    def __init__(self, data: Data, losses: Floats, most: int) -> None:
+    def __init__(self, data: Data, losses: Floats, most: int, most_sums: int = 1) -> None:
         self.inputs, self.losses, self.most = data.inputs, np.minimum(losses, 1.0), most
+        self.fitter = ConditionFitter(PRICE, _WORTH, most_sums)
         self.shares = data.weights / data.weights.sum()
 
     def fit(self, start: Order | None = None) -> Order:
@@ -69,12 +82,11 @@ class Ordering:
 
     def cost(self, order: Order) -> float:
         """Return the mean loss and the price of the inputs."""
-        return float(self.shares @ self._rest(order)[0]) + sum(map(_price, order.conditions))
+        return float(self.shares @ self._rest(order)[0]) + sum(price_of(sums, PRICE) for sums in order.conditions)
 
     def _holds(self, order: Order) -> NDArray[np.bool_]:
-        if not order.conditions:
-            return np.zeros((len(self.inputs), 0), dtype=bool)
-        return np.asarray(self.inputs @ np.array(order.conditions).T >= 0)
+        columns = [holds(self.inputs, sums) for sums in order.conditions]
+        return np.array(columns, dtype=bool).reshape(-1, len(self.inputs)).T
 
     def _rest(self, order: Order) -> list[Floats]:
         return rest_losses(self.losses[:, list(order.pieces)], self._holds(order))
@@ -104,9 +116,9 @@ class Ordering:
         for _, position, piece, condition in candidates[:_CLOSER]:
             gains = self.shares * (rest[position] - self.losses[:, piece])
             here = self._matters(gains, reached[position])
-            fewer, gain = fit_priced_condition(self.inputs[here], gains[here], condition, PRICE)
-            if fewer is not None and gain > most:
-                best, most = order.insert(position, fewer, piece), gain
+            sums, gain = self.fitter.first(self.inputs[here], gains[here], condition)
+            if sums is not None and gain > most:
+                best, most = order.insert(position, sums, piece), gain
         return best
 
     def _swept(self, order: Order, same_inputs: bool = False) -> Order:
@@ -119,17 +131,8 @@ class Ordering:
             present = Order(tuple(conditions), order.pieces)
             gains = self.shares * (self._rest(present)[index + 1] - self.losses[:, order.pieces[index]])
             here = self._matters(gains, _none(self._holds(present)[:, :index]))
-            if here.sum() < 20:
-                continue
-            old = gains[here & (self.inputs @ conditions[index] >= 0)].sum() - _price(conditions[index])
-            condition: Floats | None
-            if same_inputs:
-                condition, gain = refit_condition(self.inputs[here], gains[here], conditions[index])
-                gain -= _price(condition)
-            else:
-                condition, gain = fit_priced_condition(self.inputs[here], gains[here], conditions[index], PRICE)
-            if condition is not None and gain > old:
-                conditions[index] = condition
+            if here.sum() >= _FEWEST:
+                conditions[index] = self.fitter.again(self.inputs[here], gains[here], conditions[index], same_inputs)
         order = Order(tuple(conditions), order.pieces)
         acting = np.column_stack([self._holds(order), np.ones(len(self.inputs), dtype=bool)]).argmax(axis=1)
         pieces = [
@@ -150,10 +153,6 @@ class Ordering:
 
     def _matters(self, gains: Floats, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
         return np.asarray(reached & (np.abs(gains) > _MATTERS * self.shares.max()))
-
-
-def _price(condition: Floats) -> float:
-    return PRICE * float(np.count_nonzero(condition[:-1]))
 
 
 def _none(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -63,7 +63,7 @@ def save_state(path: Path, origin: Mapping[str, Any], state: State) -> None:
     arrays: dict[str, Any] = {
         f"{name}_{part}": getattr(program, part)
         for name, program in lists.items()
-        for part in ("conditions", "controllers")
+        for part in ("conditions", "controllers", "owners")
     }
     about = {
         "origin": _as_json(origin),
@@ -133,4 +133,4 @@ def _as_json(origin: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _list(parts: Mapping[str, Any], name: str) -> DecisionList:
-    return DecisionList(parts[f"{name}_conditions"], parts[f"{name}_controllers"])
+    return DecisionList(*(parts[f"{name}_{part}"] for part in ("conditions", "controllers", "owners")))

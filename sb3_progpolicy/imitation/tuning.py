@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -61,7 +62,8 @@ def fine_tune(
         rows = th.randint(len(data), (batch_size,), generator=generator)
         outputs = th.einsum("nd,kod->nko", inputs[rows], controllers)
         losses = loss.expected(outputs, targets[rows])
-        chances = branch_chances(inputs[rows] @ conditions.T / (first * (last / first) ** done))
+        values = _least(inputs[rows] @ conditions.T, program)
+        chances = branch_chances(values / (first * (last / first) ** done))
         objective = ((chances * losses).sum(dim=1) * weights[rows]).mean()
         optimizer.zero_grad()
         objective.backward()
@@ -70,7 +72,21 @@ def fine_tune(
                 assert parameter.grad is not None
                 parameter.grad *= mask
         optimizer.step()
-    return DecisionList(conditions.detach().double().numpy(), controllers.detach().double().numpy())
+    return replace(
+        program,
+        conditions=conditions.detach().double().numpy(),
+        controllers=controllers.detach().double().numpy(),
+    )
+
+
+def _least(sums: th.Tensor, program: DecisionList) -> th.Tensor:
+    """Return the least sum of each condition, ``(n, n_conditions)``, for all sums ``(n, n_sums)``."""
+    import torch as th
+
+    if len(program.owners) < program.n_branches:
+        return sums
+    places = [np.flatnonzero(program.owners == condition) for condition in range(program.n_branches - 1)]
+    return th.stack([sums[:, place].amin(dim=1) for place in places], dim=1)
 
 
 def branch_chances(values: th.Tensor) -> th.Tensor:

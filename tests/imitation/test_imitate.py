@@ -161,7 +161,7 @@ def test_interrupted_imitation_goes_on_as_if_nothing_had_happened(balanced, tmp_
 
 def test_branches_that_hardly_ever_act_go_while_episodes_stay_as_good():
     with Pool("CartPole-v1", 8) as pool:
-        run = algorithm._Run(pool, balance, "CartPole-v1", None, 0, 3, (), 8, (0.015, 0.05), None)
+        run = algorithm._Run(pool, balance, "CartPole-v1", None, Settings(3, 0), (), 8, (0.015, 0.05), None)
         states = np.random.default_rng(0).normal(scale=0.1, size=(500, 4)).astype(np.float32)
         run.learner.add(states, run.codec.encode(balance(states)), np.ones(500))
         rule = np.array([[-0.1, -0.5, -1, -1, 0], [0.1, 0.5, 1, 1, 0]]) * 20

@@ -99,10 +99,10 @@ def test_order_has_the_known_conditions(found):
     order = ordering.fit()
     assert 2 <= len(order.conditions) <= 4
     for known in CONDITIONS:
-        nearest = max(order.conditions, key=lambda one: _cosine(one, known))
-        assert _cosine(nearest, known) > 0.98
+        nearest = max(order.conditions, key=lambda sums: _cosine(sums[0], known))
+        assert _cosine(nearest[0], known) > 0.98
     fresh = labelled(seed=1)
-    own = DecisionList(np.array(order.conditions), pieces[list(order.pieces)])
+    own = order.as_list(pieces)
     losses = finder.loss.matrix(fresh, own.controllers)
     assert losses[np.arange(len(fresh)), own.branches(fresh.inputs)].mean() < 0.02
     again = ordering.fit(order)
@@ -116,9 +116,9 @@ def _cosine(one, other):
 
 
 def test_order_grows_and_shrinks():
-    order = Order((np.array([1.0]), np.array([2.0])), (4, 5, 6))
-    assert order.insert(2, np.array([3.0]), 7).pieces == (4, 5, 7, 6)
-    assert [[float(c[0]) for c in one.conditions] for one in map(order.without, range(3))] == [[2], [1], [1]]
+    order = Order((np.array([[1.0]]), np.array([[2.0]])), (4, 5, 6))
+    assert order.insert(2, np.array([[3.0]]), 7).pieces == (4, 5, 7, 6)
+    assert [[float(c[0, 0]) for c in one.conditions] for one in map(order.without, range(3))] == [[2], [1], [1]]
     assert [one.pieces for one in map(order.without, range(3))] == [(5, 6), (4, 6), (4, 5)]
 
 
@@ -319,7 +319,7 @@ def test_states_that_are_drawn_stand_for_all():
 
 def test_only_states_that_no_episode_comes_to_count_beside_the_episodes():
     with Pool("PandaStack-v0", 2) as pool:
-        arguments = (pool, "planner", "PandaStack-v0", [{"n_objects": 1}], 0, 3, (), 2, (0.015, 0.05))
+        arguments = (pool, "planner", "PandaStack-v0", [{"n_objects": 1}], Settings(3, 0), (), 2, (0.015, 0.05))
         runs = {augment: _Run(*arguments, augment) for augment in (None, "begun_towers", "taller_towers")}
     assert [run.selection.augment is not None for run in runs.values()] == [False, False, True]
     assert [len(run.selection.beyond) for run in runs.values()] == [0, 0, 0]  # given tasks have no validation set

@@ -1,0 +1,105 @@
+"""Conditions of several sums: found, kept in lists, written as programs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sb3_progpolicy.imitation import imitate
+from sb3_progpolicy.imitation.conjunctions import ConditionFitter, holds, price_of
+from sb3_progpolicy.imitation.conversion import rounded, to_program
+from sb3_progpolicy.imitation.decision_list import Data, DecisionList
+from sb3_progpolicy.imitation.losses import BoxLoss, mean_loss
+from sb3_progpolicy.imitation.ordering import Ordering
+from sb3_progpolicy.imitation.saving import State, load_state, save_state
+from sb3_progpolicy.imitation.tuning import fine_tune
+from sb3_progpolicy.programs import ActionSpec, ProgramRunner
+
+# Both 0.3 - x0 and x1 - 0.2 have to be there, or x2 alone.
+SUMS = np.array([[-1.0, 0, 0, 0.3], [0, 1.0, 0, -0.2], [0, 0, 1.0, -1.2]])
+CONTROLLERS = np.zeros((3, 1, 4))
+CONTROLLERS[:, 0, 3] = 0.8, -0.2, -0.8
+KNOWN = DecisionList(SUMS, CONTROLLERS, np.array([0, 0, 1]))
+
+
+def some_inputs(n=4000, seed=0):
+    return np.column_stack([np.random.default_rng(seed).normal(size=(n, 3)), np.ones(n)])
+
+
+def test_list_holds_where_all_sums_of_a_condition_do():
+    inputs = some_inputs()
+    both = (inputs[:, 0] <= 0.3) & (inputs[:, 1] >= 0.2)
+    np.testing.assert_array_equal(KNOWN.branches(inputs), np.where(both, 0, np.where(inputs[:, 2] >= 1.2, 1, 2)))
+    np.testing.assert_array_equal(KNOWN.sums_of(0), SUMS[:2])
+    np.testing.assert_array_equal(holds(inputs, SUMS[:2]), both)
+
+
+def test_branches_go_with_all_their_sums():
+    assert KNOWN.n_branches == 3
+    shorter = [KNOWN.without(index) for index in range(3)]
+    assert [one.owners.tolist() for one in shorter] == [[0], [0, 0], [0, 0]]
+    np.testing.assert_array_equal(shorter[0].conditions, SUMS[2:])
+    np.testing.assert_array_equal(shorter[1].controllers[:, 0, 3], [0.8, -0.8])
+    np.testing.assert_array_equal(shorter[2].controllers[:, 0, 3], [0.8, -0.2])
+
+
+def test_condition_of_two_sums_is_found_and_one_that_needs_no_second_has_none():
+    inputs, fitter = some_inputs(), ConditionFitter(price=1.0, worth=5.0, most=3)
+    gains = np.where(holds(inputs, SUMS[:2]), 1.0, -1.0)
+    sums, value = fitter.first(inputs, gains, np.array([-1.0, 1.0, 0, 0]))
+    assert len(sums) == 2
+    assert value == fitter.value(inputs, gains, sums) == pytest.approx(gains[gains > 0].sum() - 2, abs=5)
+    again = fitter.again(inputs, gains, np.vstack([sums, [0, 0, 0, 1.0]]), same_inputs=False)
+    assert len(again) == 2  # what always holds is not worth its place
+    assert price_of(again, 1.0) == 2
+    assert fitter.value(inputs, gains, again) >= value
+    alone = np.where(holds(inputs, SUMS[:1]), 1.0, -1.0)
+    assert len(fitter.first(inputs, alone, SUMS[0])[0]) == 1
+    assert len(ConditionFitter(1.0, 5.0, 1).first(inputs, gains, sums[0])[0]) == 1
+
+
+def test_order_asks_for_several_things_at_once_where_that_pays():
+    inputs = some_inputs()
+    data = Data(inputs, KNOWN.outputs(inputs), np.ones(len(inputs)))
+    losses = BoxLoss(np.array([True])).matrix(data, CONTROLLERS)
+    single, several = (Ordering(data, losses, 3, most) for most in (1, 3))
+    order = several.fit()
+    assert sorted(map(len, order.conditions)) == [1, 2]
+    found = order.as_list(CONTROLLERS)
+    assert (found.branches(inputs) == KNOWN.branches(inputs)).mean() > 0.99
+    assert several.cost(order) < 0.2 * single.cost(single.fit())
+    assert several.cost(several.fit(order)) <= several.cost(order)
+
+
+def test_list_becomes_a_program_of_the_same_actions():
+    inputs = some_inputs(200)
+    action = ActionSpec("box", (1,), (-1.0,), (1.0,))
+    program = to_program(KNOWN, action, ("a", "b", "c"), ("move",), False)
+    assert [condition.cell for condition in program.conditions] == ["min", "affine"]
+    np.testing.assert_allclose(ProgramRunner(program, 200).act(inputs[:, :3]), KNOWN.outputs(inputs), rtol=1e-6)
+    digits = rounded(replace(KNOWN, conditions=3.3 * SUMS), 2, np.ones(1))
+    np.testing.assert_allclose(digits.conditions, SUMS)
+    assert digits.owners.tolist() == [0, 0, 1]
+
+
+def test_numbers_of_all_sums_are_tuned():
+    inputs = some_inputs()
+    data, loss = Data(inputs, KNOWN.outputs(inputs), np.ones(len(inputs))), BoxLoss(np.array([True]))
+    shifted = replace(KNOWN, conditions=SUMS + np.array([0, 0, 0, 0.3]))
+    tuned = fine_tune(loss, shifted, data, 300, 0, (0.1, 0.02), keep_zeros=True)
+    assert tuned.owners.tolist() == [0, 0, 1]
+    assert mean_loss(loss, tuned, data) < 0.3 * mean_loss(loss, shifted, data)
+
+
+def test_state_keeps_which_condition_each_sum_is_of(tmp_path):
+    empty = np.zeros((0, 3), dtype=np.float32)
+    state = State(1, 2, {}, empty, np.zeros((0, 1)), np.zeros(0), KNOWN, (), (0.5, KNOWN), (), {}, 0.0)
+    save_state(tmp_path / "state.npz", {}, state)
+    found = load_state(tmp_path / "state.npz", {})
+    for program in (found.present, found.best[1]):
+        np.testing.assert_array_equal(program.branches(some_inputs()), KNOWN.branches(some_inputs()))
+
+
+def test_discrete_actions_are_not_accepted():
+    with pytest.raises(ValueError, match="cell='min' is not accepted for discrete actions; for Box actions it is"):
+        imitate(lambda observations: np.zeros(len(observations)), "CartPole-v1", n_timesteps=2000, cell="min")
