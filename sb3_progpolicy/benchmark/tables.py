@@ -118,7 +118,7 @@ def markdown(rows: Sequence[Row]) -> str:
     for env in dict.fromkeys(entry.env for entry in found):
         own = [entry for entry in found if entry.env == env]
         columns = columns_of(own)
-        lines += [f"### {env}", "", f"Steps by {get_domain(env).size}, mean ± standard deviation over seeds.", ""]
+        lines += [f"## {env}", "", f"Steps by {get_domain(env).size}, mean ± standard deviation over seeds.", ""]
         lines.append("| method | seeds | " + " | ".join(f"{name}{_mark(part)}" for part, name in columns) + " |")
         lines.append("|---|---:|" + "---:|" * len(columns))
         best = best_steps(own)
@@ -168,7 +168,7 @@ def is_best(entry: Entry, best: Mapping[tuple[str, str], float]) -> bool:
 def _text(entry: Entry | None, best: Mapping[tuple[str, str], float]) -> str:
     if entry is None:
         return ""
-    text = f"{entry.mean:.0f} ± {entry.std:.0f}"
+    text = f"{entry.mean:.0f} ± {entry.std:.0f}".replace(" ", "\N{NO-BREAK SPACE}")
     if entry.success < 1:
         text += f" [{entry.success:.0%}]"
     elif entry.ratio is not None:

@@ -104,7 +104,7 @@ def test_table_is_of_crisp_programs():
 
 
 def test_markdown_table():
-    text = tables.markdown(ROWS)
+    text = tables.markdown(ROWS).replace("\N{NO-BREAK SPACE}", " ")
     assert "| reptile_ppo | 3 | **63 ± 0 (1.00)** |" in text
     assert "| ppo† | 3 | 500 ± 0 [0%] |" in text, "nobody is best who solves nothing"
     assert "**7 ± 0 (1.00)**°" in text

@@ -189,8 +189,8 @@ def test_reaching_is_imitated_by_a_few_numbers_and_the_same_after_an_interruptio
         reset(self, row, seed, variation)
 
     monkeypatch.setattr(Pool, "reset", spy)
-    monkeypatch.setattr(algorithm, "N_PLAIN_ROUNDS", 4)
-    arguments = {"n_timesteps": 4000, "n_episodes": 6, "max_conditions": 0, "n_envs": 6}
+    monkeypatch.setattr(algorithm, "N_PLAIN_ROUNDS", 2)
+    arguments = {"n_timesteps": 2500, "n_episodes": 6, "max_conditions": 0, "n_envs": 6}
     state, early = tmp_path / "state.npz", tmp_path / "early.npz"
 
     def keep(progress):
