@@ -199,7 +199,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=100, help="episodes on each variation")
     parser.add_argument("--n-timesteps", type=int, default=30_000, help="states to label")
     parser.add_argument("--max-conditions", type=int, default=11, help="of the program at most")
-    parser.add_argument("--cell", default="affine", help="of the conditions: affine, min or gru")
+    parser.add_argument("--cell", default="affine", choices=("affine", "min"), help="of the conditions")
     parser.add_argument("--interaction", action="store_true", help="read the previous action, reward and done flag")
     parser.add_argument("--set", nargs="+", help="variations to learn on, as name=value; by default the training ones")
     parser.add_argument("--augment", help="more than the training variations: taller_towers or begun_towers")
@@ -212,7 +212,8 @@ def main() -> None:
     commit()  # of the code that is loaded now
     spec_of(options.env)
     PROGRAMS.mkdir(parents=True, exist_ok=True)
-    name = options.name or f"imitation_{options.env.rpartition('-')[0].lower()}"
+    suffix = "" if options.cell == "affine" else f"_{options.cell}"
+    name = options.name or f"imitation_{options.env.rpartition('-')[0].lower()}{suffix}"
     folder = Path("runs") / name
     arguments: dict[str, Any] = {
         key: getattr(options, key) for key in ("n_timesteps", "max_conditions", "augment", "interaction")

@@ -60,7 +60,7 @@ SIMPLIFIED = Path(__file__).parent / "results" / "simplified"
 DEPTH = 8
 DISTILLATION_SEED, EVALUATION_SEED = 0, 10_000
 # What a unit makes of its sums and its memory: 0.5 + 0.5 * tanh(0.5 * x) for a gate, then the update.
-OPERATIONS_OF_A_UNIT = {"affine": 0, "rnn": 0, "gru": 2 * 3 + 5, "lstm": 3 * 3 + 4, "switch": 2}
+OPERATIONS_OF_A_UNIT = {"affine": 0, "min": 0, "rnn": 0, "gru": 2 * 3 + 5, "lstm": 3 * 3 + 4, "switch": 2}
 Row = dict[str, Any]
 Floats = NDArray[np.floating]
 C_LOOP = """
@@ -144,7 +144,8 @@ def program_operations(program: Program) -> tuple[int, int]:
         for c in program.conditions
     )
     controller = max(2 * count_nonzero(c.weights) + count_nonzero(c.bias) for c in program.controllers)
-    return conditions + controller, len(program.conditions) + choice_comparisons(program.action)
+    tests = sum(max(1, len(condition.sums)) for condition in program.conditions)
+    return conditions + controller, tests + choice_comparisons(program.action)
 
 
 # Unfolding into Python

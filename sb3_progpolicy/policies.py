@@ -100,7 +100,8 @@ class ProgrammaticPolicy(ProgrammaticActorCritic):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         if kwargs.setdefault("cell", "affine") != "affine":
             raise ValueError(
-                f"cell={kwargs['cell']!r} is not accepted; recurrent cells need RecurrentProgrammaticPolicy"
+                f"cell={kwargs['cell']!r} is not accepted; 'affine' is, and recurrent cells (gru, lstm, rnn) are those "
+                "of RecurrentProgrammaticPolicy"
             )
         super().__init__(*args, **kwargs)
 

@@ -129,14 +129,15 @@ def _label(condition: Condition, index: int, number: Decimals, program: ProgramD
     """Return a condition in a few words."""
     if condition.remembers:
         return f"B{index + 1}: memory ({condition.cell})"
-    sums = [_sum(constant, weights, number, program.input_names) for constant, weights in condition.sums]
+    most = _TERMS if condition.cell == "affine" else 1
+    sums = [_sum(constant, weights, number, program.input_names, most) for constant, weights in condition.sums]
     text = sums[0] if condition.cell == "affine" else f"min({', '.join(sums)})"
     text = f"B{index + 1} = {text} >= 0"
     text = text if len(text) <= _LABEL else f"{text[: _LABEL - 3]}..."
     return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
-def _sum(constant: float, weights: Sequence[float], number: Decimals, names: Sequence[str]) -> str:
-    terms = largest_terms(weights, names, number.digits, _TERMS)
+def _sum(constant: float, weights: Sequence[float], number: Decimals, names: Sequence[str], most: int) -> str:
+    terms = largest_terms(weights, names, number.digits, most)
     text = " ".join(f"{'-' if weight < 0 else '+'} {number.factor(weight, '*')}{name}" for weight, name in terms.shown)
     return f"{number(constant) + ' ' if constant else ''}{text}{' + ...' if terms.n_dropped else ''}"

@@ -98,6 +98,7 @@ class Rules:
             if index not in self.switched.terms:
                 what = "has a memory" if original.remembers else "is the least of several sums"
                 self.notes.append(f"condition {index + 1} {what} and stays as it is")
+                self.ties.append(False)
             return original
         reaching = self.situations.branches >= index
         inputs, true = self.situations.inputs[reaching], self.situations.branches[reaching] == index

@@ -21,11 +21,11 @@ STYLES = ("-", "--", "-.", ":")
 
 def look(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Return a colour and a line style for each method, the same in all pictures of a report; the first lie on top."""
-    colours, styles = (lambda k: COLOURS[k % len(COLOURS)]), (lambda k: STYLES[k % len(STYLES)])
-    return {
-        method: {"color": colours(number), "linestyle": styles(number), "zorder": 3 - number / 100}
-        for number, method in enumerate(methods)
-    }
+    found = {}
+    for number, method in enumerate(methods):
+        colour, style = COLOURS[number % len(COLOURS)], STYLES[number % len(STYLES)]
+        found[method] = {"color": colour, "linestyle": style, "zorder": 3 - number / 100}
+    return found
 
 
 def curves(cells: Sequence[Row], envs: Sequence[str], looks: Mapping[str, dict[str, Any]]) -> Figure:

@@ -28,7 +28,10 @@ def distill(
     n_timesteps: Annotated[int, typer.Option("--n-timesteps", "-n", min=1, help="states to label")] = 30_000,
     max_conditions: Annotated[int, typer.Option("--max-conditions", min=0, help="of the program at most")] = 11,
     cell: Annotated[
-        str, typer.Option("--cell", help="of the conditions: affine; min, several at once; gru, which remembers")
+        str,
+        typer.Option(
+            "--cell", help="of the conditions: affine, min (up to three tests at once), or gru, which remembers"
+        ),
     ] = "affine",
     seed: Annotated[int, typer.Option("--seed", min=0, help="of all draws")] = 0,
     interaction: Annotated[

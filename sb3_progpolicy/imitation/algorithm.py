@@ -25,11 +25,13 @@ from sb3_progpolicy.imitation.tasks import names_of, training_variations, valida
 from sb3_progpolicy.imitation.teachers import Teacher, TeacherLike, make_teacher
 from sb3_progpolicy.imitation.visits import Collector
 from sb3_progpolicy.programs.program import Program
-from sb3_progpolicy.programs.syntax import STATELESS, Expression
+from sb3_progpolicy.programs.syntax import Expression
 from sb3_progpolicy.spaces import action_spec
 
 #: Share of the teacher in each round; 0 in all later ones.
 TEACHER_SHARES = (1.0, 0.6, 0.4, 0.3, 0.2, 0.1)
+#: Of the conditions that :func:`imitate` makes.
+CELLS = ("affine", "min", *RECURRENT_CELLS)
 #: Sums of a condition at most, if ``cell="min"``.
 MAX_SUMS = 3
 N_ROUNDS, N_PLAIN_ROUNDS, N_SPARSE_ROUNDS = 9, 10, 3
@@ -119,9 +121,11 @@ def imitate(
     :return: the program; its metadata say that it was learned by imitation, and of whom
     :raises ValueError: if an argument is not accepted
     """
-    if cell not in (*STATELESS, *RECURRENT_CELLS):
-        raise ValueError(f"cell={cell!r} is not accepted; conditions of imitated programs are 'affine', 'min' or 'gru'")
-    remembers = cell not in STATELESS
+    if cell not in CELLS:
+        raise ValueError(f"cell={cell!r} is not accepted; cells of imitated programs are {', '.join(CELLS)}")
+    remembers = cell in RECURRENT_CELLS
+    if cell == "min" and max_conditions < 1:
+        raise ValueError(f"cell='min' is not accepted with max_conditions={max_conditions}; with at least 1 it is")
     if remembers and (augment is not None or checkpoint is not None or max_conditions < 1):
         raise ValueError(
             f"cell={cell!r} is not accepted with augment={augment!r}, checkpoint={str(checkpoint)!r}, "
@@ -226,7 +230,7 @@ class _Run:
             **self.origin,
             "n_steps": n_steps,
             "max_branches": self.learner.settings.max_branches,
-            "max_sums": self.learner.settings.max_sums,
+            **({"cell": "min"} if self.learner.settings.max_sums > 1 else {}),
             "n_episodes": self.judge.n_episodes,
             "score_tolerance": self.judge.tolerance,
             "plain_tolerance": self.selection.plain_tolerance,

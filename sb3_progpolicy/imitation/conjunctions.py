@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from sb3_progpolicy.imitation.conditions import fit_condition, fit_priced_condition, refit_condition
 from sb3_progpolicy.imitation.decision_list import Floats
 
-_FEWEST = 20  # states that a sum is fitted to
+FEWEST = 20  # states that a sum is fitted to
 
 
 def holds(inputs: Floats, sums: Floats) -> NDArray[np.bool_]:
@@ -20,20 +20,11 @@ def holds(inputs: Floats, sums: Floats) -> NDArray[np.bool_]:
     return np.asarray((inputs @ sums.T >= 0).all(axis=1))
 
 
-def price_of(sums: Floats, price: float) -> float:
-    """Return what the inputs of a condition cost.
-
-    :param sums: ``(n_sums, width)``
-    :param price: of an input
-    """
-    return price * float(np.count_nonzero(sums[:, :-1]))
-
-
 class ConditionFitter:
     """Fits conditions to gains, with a price on each input and on each further sum.
 
     :param price: of an input, in the unit of the gains
-    :param worth: what a further sum has to gain beyond the price of its inputs
+    :param worth: price of a further sum, beyond that of its inputs
     :param most: number of sums at most
     """
 
@@ -41,8 +32,15 @@ class ConditionFitter:
         self.price, self.worth, self.most = price, worth, most
 
     def value(self, inputs: Floats, gains: Floats, sums: Floats) -> float:
-        """Return the sum of the gains where a condition holds, less the price of its inputs."""
-        return float(gains[holds(inputs, sums)].sum()) - price_of(sums, self.price)
+        """Return the sum of the gains where a condition holds, less its price."""
+        return float(gains[holds(inputs, sums)].sum()) - self.price_of(sums)
+
+    def price_of(self, sums: Floats) -> float:
+        """Return what the inputs of a condition and its further sums cost.
+
+        :param sums: ``(n_sums, width)``
+        """
+        return self.price * float(np.count_nonzero(sums[:, :-1])) + self.worth * (len(sums) - 1)
 
     def first(self, inputs: Floats, gains: Floats, start: Floats) -> tuple[Floats | None, float]:
         """Return a condition that begins with one known sum, and its value.
@@ -74,7 +72,7 @@ class ConditionFitter:
         value = self.value(inputs, gains, sums)
         for index in range(len(sums)):
             here = holds(inputs, np.delete(sums, index, axis=0))
-            if here.sum() < _FEWEST:
+            if here.sum() < FEWEST:
                 continue
             fitted: Floats | None
             if same_inputs:
@@ -95,7 +93,7 @@ class ConditionFitter:
         while len(sums) < self.most:
             here = holds(inputs, sums)
             lost = -np.minimum(gains[here], 0).sum()
-            if here.sum() < _FEWEST or lost < self.worth + self.price:
+            if here.sum() < FEWEST or lost < self.worth + self.price:
                 break
             start, _ = fit_condition(inputs[here], gains[here], ridges=(1e-3,), cautions=(1.0,))
             if start is None:
@@ -104,7 +102,7 @@ class ConditionFitter:
             if further is None:
                 break
             more, reached = self._refitted(inputs, gains, np.vstack([sums, further]), same_inputs=True)
-            if reached <= value + self.worth:
+            if reached <= value:
                 break
             sums, value = more, reached
         return sums, value
@@ -115,7 +113,7 @@ class ConditionFitter:
             fewer = [np.delete(sums, index, axis=0) for index in range(len(sums))]
             values = [self.value(inputs, gains, one) for one in fewer]
             best = int(np.argmax(values))
-            if values[best] <= value - self.worth:
+            if values[best] < value:
                 break
-            sums, value = fewer[best], max(value, values[best])
+            sums, value = fewer[best], values[best]
         return sums

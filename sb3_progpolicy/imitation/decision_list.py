@@ -87,9 +87,9 @@ class Scaler:
 class DecisionList:
     """The first condition that holds decides which controller acts; the last controller acts where none holds.
 
-    A condition holds where none of its sums, products with the inputs, is below 0.
+    A condition has one or more sums over the inputs. It holds where none of them is below 0.
 
-    :param conditions: their sums, ``(n_sums, n_inputs + 1)``
+    :param conditions: the weights of all sums, ``(n_sums, n_inputs + 1)``
     :param controllers: ``(n_branches, n_outputs, n_inputs + 1)``
     :param owners: of which condition each sum is, ascending, ``(n_sums,)``; by default each is a condition
     """
@@ -101,6 +101,8 @@ class DecisionList:
     def __post_init__(self) -> None:
         if self.owners is None:
             object.__setattr__(self, "owners", np.arange(len(self.conditions)))
+        assert np.array_equal(np.unique(self.owners), np.arange(self.n_branches - 1)), "each condition has a sum"
+        assert len(self.owners) == len(self.conditions), "each sum has an owner"
 
     @property
     def n_branches(self) -> int:
@@ -133,15 +135,17 @@ class DecisionList:
         return np.asarray(np.einsum("nd,nod->no", inputs, self.controllers[self.branches(inputs)]))
 
     def insert(self, position: int, condition: Floats, controller: Floats) -> DecisionList:
-        """Return the list with one more branch, if each condition is one sum.
+        """Return the list with one more branch, whose condition is one sum.
 
         :param position: of the new branch; at most that of the last controller, which stays the last
         :param condition: ``(n_inputs + 1,)``
         :param controller: ``(n_outputs, n_inputs + 1)``
         """
+        place = int(np.searchsorted(self.owners, position))
         return DecisionList(
-            np.insert(self.conditions, position, condition, axis=0),
+            np.insert(self.conditions, place, condition, axis=0),
             np.insert(self.controllers, position, controller, axis=0),
+            np.insert(self.owners + (self.owners >= position), place, position),
         )
 
     def without(self, index: int) -> DecisionList:

@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_progpolicy.imitation.conditions import fit_condition
-from sb3_progpolicy.imitation.conjunctions import ConditionFitter, holds, price_of
+from sb3_progpolicy.imitation.conjunctions import FEWEST, ConditionFitter, holds
 from sb3_progpolicy.imitation.decision_list import Data, DecisionList, Floats, rest_losses
 
 PRICE = 0.001  # of an input of a condition, in mean loss
 _WORTH = 0.001  # mean loss that a branch has to take away beyond the price of its condition
 _MATTERS = 1e-3  # a gain, as a share of the largest weight, below which a state does not matter
-_FEWEST = 20  # states that a condition is fitted to
 _CLOSER = 6  # insertions that are looked at with few inputs, the best of those with all inputs
 
 
@@ -81,8 +80,8 @@ class Ordering:
         return self._shortened(self._swept(order))
 
     def cost(self, order: Order) -> float:
-        """Return the mean loss and the price of the inputs."""
-        return float(self.shares @ self._rest(order)[0]) + sum(price_of(sums, PRICE) for sums in order.conditions)
+        """Return the mean loss and the price of the conditions."""
+        return float(self.shares @ self._rest(order)[0]) + sum(map(self.fitter.price_of, order.conditions))
 
     def _holds(self, order: Order) -> NDArray[np.bool_]:
         columns = [holds(self.inputs, sums) for sums in order.conditions]
@@ -93,8 +92,8 @@ class Ordering:
 
     def _with_one_more(self, order: Order) -> Order | None:
         """Return the order with the branch of the largest gain, whatever piece and position, if there is one."""
-        rest, holds = self._rest(order), self._holds(order)
-        reached = [_none(holds[:, :position]) for position in range(len(order.pieces))]
+        rest, holding = self._rest(order), self._holds(order)
+        reached = [_none(holding[:, :position]) for position in range(len(order.pieces))]
         bounds = []  # of what each piece can gain at each position
         for position in range(len(order.pieces)):
             gains = self.shares[:, None] * (rest[position][:, None] - self.losses)
@@ -131,7 +130,7 @@ class Ordering:
             present = Order(tuple(conditions), order.pieces)
             gains = self.shares * (self._rest(present)[index + 1] - self.losses[:, order.pieces[index]])
             here = self._matters(gains, _none(self._holds(present)[:, :index]))
-            if here.sum() >= _FEWEST:
+            if here.sum() >= FEWEST:
                 conditions[index] = self.fitter.again(self.inputs[here], gains[here], conditions[index], same_inputs)
         order = Order(tuple(conditions), order.pieces)
         acting = np.column_stack([self._holds(order), np.ones(len(self.inputs), dtype=bool)]).argmax(axis=1)

@@ -133,4 +133,5 @@ def _as_json(origin: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _list(parts: Mapping[str, Any], name: str) -> DecisionList:
-    return DecisionList(*(parts[f"{name}_{part}"] for part in ("conditions", "controllers", "owners")))
+    given = ("conditions", "controllers", "owners")
+    return DecisionList(*(parts[f"{name}_{part}"] for part in given if f"{name}_{part}" in parts))

@@ -127,6 +127,9 @@ def _facts(program: ProgramData) -> list[str]:
     weights = [np.array(controller.weights).ravel() for controller in program.controllers]
     weights += [np.array(controller.bias) for controller in program.controllers]
     for condition in program.conditions:
+        if not condition.remembers:
+            weights += [np.array([constant, *row]) for constant, row in condition.sums]
+            continue
         matrices = (condition.weight_ih, condition.weight_hh, condition.bias_ih, condition.bias_hh, condition.readout)
         weights += [np.array(matrix, dtype=float).ravel() for matrix in matrices]
         weights.append(np.array([condition.readout_bias]))

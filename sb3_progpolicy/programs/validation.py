@@ -111,11 +111,14 @@ def _check_condition(path: str, condition: Condition, n_inputs: int) -> None:
 def _check_min(path: str, condition: Condition, n_inputs: int) -> None:
     """Check the least of some sums."""
     if not isinstance(condition.bias_ih, tuple) or not condition.bias_ih:
-        raise ValueError(f"{path}.bias_ih: {_count(condition.bias_ih, 'sums')} given; 'min' has at least 1")
+        raise ValueError(
+            f"{path}.bias_ih: {_count(condition.bias_ih, 'numbers')} given; for 'min' a tuple of at least 1 is accepted"
+        )
     _check_vector(f"{path}.bias_ih", condition.bias_ih, len(condition.bias_ih))
     _check_matrix(f"{path}.weight_ih", condition.weight_ih, len(condition.bias_ih), n_inputs)
     for name in ("weight_hh", "bias_hh", "readout"):
         _check_vector(f"{path}.{name}", getattr(condition, name), 0)
+    _check_vector(f"{path}.readout_bias", (condition.readout_bias,), 1)
     if condition.readout_bias != 0:
         raise ValueError(f"{path}.readout_bias={_short(condition.readout_bias)} is not accepted; of 'min' it is 0")
 

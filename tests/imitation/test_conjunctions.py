@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from sb3_progpolicy.imitation import imitate
-from sb3_progpolicy.imitation.conjunctions import ConditionFitter, holds, price_of
+from sb3_progpolicy.imitation.actions import ActionCodec
+from sb3_progpolicy.imitation.conjunctions import ConditionFitter, holds
 from sb3_progpolicy.imitation.conversion import rounded, to_program
 from sb3_progpolicy.imitation.decision_list import Data, DecisionList
+from sb3_progpolicy.imitation.learner import Learner, Settings
 from sb3_progpolicy.imitation.losses import BoxLoss, mean_loss
 from sb3_progpolicy.imitation.ordering import Ordering
 from sb3_progpolicy.imitation.saving import State, load_state, save_state
@@ -48,10 +50,10 @@ def test_condition_of_two_sums_is_found_and_one_that_needs_no_second_has_none():
     gains = np.where(holds(inputs, SUMS[:2]), 1.0, -1.0)
     sums, value = fitter.first(inputs, gains, np.array([-1.0, 1.0, 0, 0]))
     assert len(sums) == 2
-    assert value == fitter.value(inputs, gains, sums) == pytest.approx(gains[gains > 0].sum() - 2, abs=5)
+    assert value == fitter.value(inputs, gains, sums) == pytest.approx(gains[gains > 0].sum() - 7, abs=5)
     again = fitter.again(inputs, gains, np.vstack([sums, [0, 0, 0, 1.0]]), same_inputs=False)
     assert len(again) == 2  # what always holds is not worth its place
-    assert price_of(again, 1.0) == 2
+    assert fitter.price_of(again) == 2 + 5
     assert fitter.value(inputs, gains, again) >= value
     alone = np.where(holds(inputs, SUMS[:1]), 1.0, -1.0)
     assert len(fitter.first(inputs, alone, SUMS[0])[0]) == 1
@@ -100,6 +102,32 @@ def test_state_keeps_which_condition_each_sum_is_of(tmp_path):
         np.testing.assert_array_equal(program.branches(some_inputs()), KNOWN.branches(some_inputs()))
 
 
+def test_learner_makes_lists_of_several_sums_and_goes_on_from_them():
+    spec = ActionSpec("box", (1,), (-1.0,), (1.0,))
+    codec = ActionCodec(spec, ("move",))
+    learners = {most: Learner(codec, np.ones(3, dtype=bool), Settings(4, 0, max_sums=most)) for most in (1, 3)}
+    inputs = some_inputs()
+    for learner in learners.values():
+        learner.add(inputs[:, :-1].astype(np.float32), KNOWN.outputs(inputs), np.ones(len(inputs)))
+    [single], [several] = (learner.plain([], anew=False) for learner in learners.values())
+    assert len(single.owners) == single.n_branches - 1
+    assert several.owners.tolist() in ([0, 0, 1], [0, 1, 1])
+    assert (several.outputs(inputs) - KNOWN.outputs(inputs)).std() < 0.1
+    again = learners[3].plain([several], anew=False)
+    assert again[0].owners.tolist() == several.owners.tolist()
+
+
+def test_list_with_several_sums_takes_one_more_branch():
+    longer = KNOWN.insert(1, np.ones(4), np.ones((1, 4)))
+    assert longer.owners.tolist() == [0, 0, 1, 2]
+    np.testing.assert_array_equal(longer.conditions[[0, 1, 3]], SUMS)
+    assert KNOWN.insert(0, np.ones(4), np.ones((1, 4))).owners.tolist() == [0, 1, 1, 2]
+    with pytest.raises(AssertionError, match="each condition has a sum"):
+        DecisionList(SUMS, CONTROLLERS)
+
+
 def test_discrete_actions_are_not_accepted():
     with pytest.raises(ValueError, match="cell='min' is not accepted for discrete actions; for Box actions it is"):
         imitate(lambda observations: np.zeros(len(observations)), "CartPole-v1", n_timesteps=2000, cell="min")
+    with pytest.raises(ValueError, match="cell='min' is not accepted with max_conditions=0; with at least 1 it is"):
+        imitate("planner", "PandaReach-v0", n_timesteps=2000, cell="min", max_conditions=0)

@@ -1,5 +1,6 @@
 """Pages in headless Chromium: no error, no request, and keys and clicks do what they say."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from tests.programs.hostile import with_hostile_texts
 from tests.programs.strategies import build_program, hanoi_program, small_program
 from tests.programs.test_grids import OTHER
 from tests.programs.test_grids import program as on_a_grid
+from tests.programs.test_min import grip
 
 SMALL_STACKING = Path(__file__).parents[2] / "benchmarks" / "results" / "simplified" / "Stacking-v0.json"
 PAGES = {
@@ -26,6 +28,7 @@ PAGES = {
     "table": lambda: on_a_grid(OTHER, -3.0, 1.5),
     "switch": lambda: maze.program(maze.SWITCH),
     "recurrent": lambda: hanoi_program(3, "gru"),
+    "min": lambda: hanoi_program(3, "min"),
     "unknown": lambda: build_program(5, ["lstm", "affine"], "multi_discrete", True),
 }
 T, LAST = "page.t", "page.frames.length - 1"
@@ -256,6 +259,20 @@ def test_a_switch_is_shown_as_what_turns_it_on_and_off(visit, tab):
         "on when \u22121 + 1 cue_right \u2265 0",
         "off when \u22121 + 1 cue_left \u2265 0",
     ]
+
+
+def test_a_min_is_shown_with_all_its_sums_and_the_least_is_explained(visit, tab):
+    visit(grip())
+    assert tab.evaluate(SHOWN.replace("SELECTOR", ".test .sum .sum")) == [
+        "0.50 \u2212 1 distance",
+        "1 \u2212 2 height",
+    ]
+    visit(hanoi_program(3, "min"))
+    tab.evaluate("document.querySelector('[data-thing=B1]').click()")
+    heading = tab.evaluate("document.querySelector('h3 em').textContent")
+    assert re.fullmatch(r"B1, its least sum \([123] of 3\)", heading)
+    total = tab.evaluate("document.querySelector('.reason.total .number').textContent")
+    assert total == tab.evaluate("document.querySelector('[data-thing=B1] .number').textContent")
 
 
 def test_hostile_names_are_shown_as_they_are(visit, tab):

@@ -97,13 +97,18 @@ def test_tables_of_conditions():
     weights = (*np.ravel(OTHER).astype(float).tolist(), 0.0)
     affine = Condition("affine", (), (), (), (), weights, 1.0)
     switch = Condition("switch", (weights, (0.0,) * 7), ((0.0,), (0.0,)), (0.0, 1.0), (0.0, 0.0), (1.0,), -0.5)
-    for condition, shown in ((affine, "B1 = table*(T1) + 1 >= 0:\n"), (switch, "on when  table*(T1) >= 0\n")):
+    least = Condition("min", (weights, (0.0,) * 7), (), (1.0, 2.0), (), (), 0.0)
+    for condition, shown, name in (
+        (affine, "B1 = table*(T1) + 1 >= 0:\n", "B_{1}"),
+        (switch, "on when  table*(T1) >= 0\n", "B_{1,1}"),
+        (least, "B1 = min(table*(T1) + 1, 2) >= 0:\n", "B_{1,1}"),
+    ):
         one = program(np.zeros((2, 3)), 1.0)
         one = dataclasses.replace(one, body=IfThenElse(condition, one.body, one.body))
         assert shown in export_text(one)
         assert "T1 = " in export_text(one)
         assert "table*(T1)" in export_graphviz(one)
-        assert r"B_{1}, \text{table} = \left(" in export_latex(one)
+        assert rf"{name}, \text{{table}} = \left(" in export_latex(one)
 
 
 def test_pictures_show_the_table_beside_its_sum():

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from sb3_progpolicy import ReptilePPO
+from sb3_progpolicy.analysis.activity import _label
+from sb3_progpolicy.analysis.finetune import why_not
 from sb3_progpolicy.programs import (
     ActionSpec,
     Condition,
@@ -20,6 +22,7 @@ from sb3_progpolicy.programs import (
     export_text,
     plot_program,
 )
+from sb3_progpolicy.programs.export.visitor import Decimals
 from sb3_progpolicy.programs.transform import fold_normalization
 
 NEAR_AND_LOW = Condition("min", ((-1.0, 0.0), (0.0, -2.0)), (), (0.5, 1.0), (), (), 0.0)
@@ -44,7 +47,7 @@ def test_min_holds_where_all_of_its_sums_do():
 def test_min_is_printed_as_what_it_is():
     text = export_text(grip())
     assert "if B1 = min(0.50 - distance, 1 - 2*height) >= 0:" in text
-    assert "A min is not below 0 where all of its sums are not." in text
+    assert "A min is the least of its sums: it holds where none of them is below 0." in text
     assert "All memory" not in text
     assert "if 0.5 - distance >= 0 and 1 - 2 * height >= 0:" in export_python(grip())
     assert "B1 is the least of" in export_graphviz(grip())
@@ -74,6 +77,19 @@ def test_python_of_a_long_min_runs():
         assert policy.act(inputs.tolist()) == pytest.approx(runner.act(inputs[None])[0])
 
 
+def test_what_is_not_a_number_holds_nowhere():
+    far = Condition("min", ((1.0,) * 7, (1e308, -1e308, *(0.0,) * 5)), (), (0.0, 1.0), (), (), 0.0)
+    names = tuple(f"x{index}" for index in range(7))
+    still, go = Controller(((0.0,) * 7,), (0.0,)), Controller(((1.0,) * 7,), (0.0,))
+    body = IfThenElse(far, still, go)
+    program = replace(grip(), body=body, n_observations=7, input_names=names)
+    observation, space = [10.0, 10.0, *[0.0] * 5], {}
+    with np.errstate(invalid="ignore", over="ignore"):
+        assert ProgramRunner(program).act([observation]) == 1.0
+    exec(compile(export_python(program), "program.py", "exec"), space)
+    assert space["ProgramPolicy"]().act(observation) == [1.0]
+
+
 def test_normalisation_is_folded_into_every_sum():
     mean, scale = np.array([0.5, -1.0]), np.array([2.0, 0.1])
     folded, inputs = fold_normalization(grip(), mean, scale), np.random.default_rng(0).normal(size=(20, 2))
@@ -86,10 +102,12 @@ def test_normalisation_is_folded_into_every_sum():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"bias_ih": (), "weight_ih": ()}, r"bias_ih: 0 sums given; 'min' has at least 1"),
+        ({"bias_ih": (), "weight_ih": ()}, r"bias_ih: 0 numbers given; for 'min' a tuple of at least 1 is accepted"),
         ({"weight_ih": ((1.0, 0.0),)}, r"weight_ih: 1 rows given; a tuple of 2 rows is accepted"),
         ({"weight_ih": ((1.0,), (0.0,))}, r"weight_ih\[0\]: 1 numbers given; a tuple of 2 numbers"),
         ({"readout": (1.0, 1.0)}, r"readout: 2 numbers given; a tuple of 0 numbers"),
+        ({"bias_ih": [0.5, 1.0]}, r"bias_ih: 2 numbers given; for 'min' a tuple"),
+        ({"readout_bias": False}, r"readout_bias: False is not accepted; finite numbers are"),
         ({"readout_bias": 1.0}, r"readout_bias=1.0 is not accepted; of 'min' it is 0"),
         ({"bias_hh": (0.0,)}, r"bias_hh: 1 numbers given"),
     ],
@@ -106,3 +124,9 @@ def test_training_does_not_start_from_a_min():
     program = replace(program, body=IfThenElse(wide, controller, controller))
     with pytest.raises(ValueError, match="init_program: a min of several sums is not trained"):
         ReptilePPO("PRLPolicy", "Pendulum-v1", n_envs=1, init_program=program)
+
+
+def test_picture_of_an_episode_and_simplification_say_what_a_min_is():
+    number = Decimals(2)
+    assert _label(NEAR_AND_LOW, 0, number, grip()) == "B1 = min(0.50 - distance, 1 - 2*height) >= 0"
+    assert "a min of several sums is not trained" in why_not(grip())

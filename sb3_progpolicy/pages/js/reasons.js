@@ -100,8 +100,9 @@ class ReasonsView {
     const { cell, readout, readoutBias, weightIh, biasIh } = program.conditions[index];
     if (cell === "min") {
       const totals = weightIh.map((row, i) => row.reduce((sum, weight, j) => sum + weight * inputs[j], biasIh[i]));
-      const least = totals.indexOf(Math.min(...totals)); // this sum is B
-      const sum = { name: thing, total: totals[least], constant: biasIh[least], weights: weightIh[least] };
+      const least = totals.findIndex((total) => Object.is(total, Math.min(...totals))); // this sum is B
+      const name = totals.length > 1 ? `${thing}, its least sum (${least + 1} of ${totals.length})` : thing;
+      const sum = { name, total: totals[least], constant: biasIh[least], weights: weightIh[least] };
       return { ...sum, values: inputs, names: program.inputNames };
     }
     const sum = { name: thing, total: conditionValues[index], constant: readoutBias, weights: readout };

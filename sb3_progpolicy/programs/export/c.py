@@ -223,10 +223,12 @@ class _CPrinter(ProgramVisitor[list[str]]):
             lines = [f"double m[{len(condition.sums)}];"]
             for place, (bias, weights) in enumerate(condition.sums):
                 lines += self._sum(f"m[{place}]", bias, weights, self.inputs)
-            lines += [f"b{index} = m[0];"]
-            lines += [f"for (int k = 1; k < {len(condition.sums)}; k++) if (m[k] < b{index}) b{index} = m[k];"] * (
-                len(condition.sums) > 1
-            )
+            lines.append(f"b{index} = m[0];")
+            if (n_sums := len(condition.sums)) > 1:
+                # What is not a number stays, and is then not at least 0.
+                lines.append(
+                    f"for (int k = 1; k < {n_sums}; k++) if (m[k] < b{index} || m[k] != m[k]) b{index} = m[k];"
+                )
             return [f"double b{index};", "{", *_indented(lines), "}"]
         size = condition.hidden_size
         gates = ("a",) if condition.cell == "rnn" else GATES[condition.cell]

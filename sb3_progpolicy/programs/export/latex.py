@@ -103,7 +103,8 @@ class _LatexPrinter(ProgramVisitor[list[str]]):
         ]
         for index, condition in enumerate(program.conditions, start=1):
             rows = condition.weight_ih if condition.cell == "switch" else [weights for _, weights in condition.sums]
-            sums += [(f"B_{{{index}}}", row) for row in rows]
+            for number, row in enumerate(rows, start=1):
+                sums.append((f"B_{{{index}{f',{number}' if len(rows) > 1 else ''}}}", row))
         for block in blocks_of(program):
             for where, weights in sums:
                 table = as_table(block, weights)

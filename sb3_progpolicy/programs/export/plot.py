@@ -142,7 +142,8 @@ class _PlotPrinter(ProgramVisitor[list[tuple["_Card | None", _Card]]]):
         if condition.cell == "min":
             sums = [self._terms(constant, *self._collapsed(weights)) for constant, weights in condition.sums]
             least = ((f"B{index + 1} is the least of", QUIET, 0),)
-            return _Card((_head(index), least, *(_in_a_row(*one) for one in sums), *self._new_tables()))
+            rows = (least, *(_in_a_row(*one) for one in sums))
+            return _Card((_head(index), *rows, *self._new_tables(), (("no memory", QUIET, 0),)))
         if condition.cell == "affine":
             readout, names = self._collapsed(condition.readout)
             constant, terms = self._terms(condition.readout_bias, readout, names)

@@ -39,8 +39,8 @@ def export_python(program: ProgramData, out_file: str | os.PathLike[str] | Any |
     previous_done)`` and chooses the same actions as :class:`~sb3_progpolicy.programs.interpreter.ProgramRunner` with
     crisp semantics, to the last bit of every number: sums are taken in the same order. Terms with the weight 0 are not
     written, and whole numbers without a point. A program none of whose sums has more than six terms is written as a
-    person would: it reads only the inputs that it needs, by their names, tests affine conditions where they decide, and
-    returns an action that does not depend on them as it is.
+    person would: it reads only the inputs that it needs, by their names, tests conditions without memory where they
+    decide, and returns an action that does not depend on them as it is.
 
     No text of a program becomes code, whoever made it: names and title are written as string literals and comments in
     ASCII, with all other characters escaped. Variables are named with letters, digits and underscores only.
@@ -96,20 +96,25 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
         ]
 
     def _test(self, word: str, condition: Condition, index: int) -> list[str]:
-        if not self.by_hand or condition.remembers:
+        if condition.remembers or (condition.cell == "affine" and not self.by_hand):
             return [f"{word} b{index} >= 0.0:"]
-        sums = []
-        for constant, weights in condition.sums:
-            terms = zip(weights, self._variables(), strict=True)
-            sums.append(sum_tokens(number(constant), [term for term in terms if term[0]]))
-        line = f"{word} {' and '.join(' '.join([*tokens, '>= 0']) for tokens in sums)}:"
+        # Each sum of a min is tested by itself: Python's min() may pass over what is not a number.
+        sums, zero = [[name] for name in _sum_names(condition, index)], "0.0"
+        if self.by_hand:
+            sums, zero = [self._tokens(*one) for one in condition.sums], "0"
+        line = f"{word} {' and '.join(' '.join([*tokens, f'>= {zero}']) for tokens in sums)}:"
         if len(line) <= WIDTH - 10:
             return [line]
         if len(sums) == 1:
             return [f"{word} (", *pack(sums[0], "    ", "    ", WIDTH - 12), ") >= 0:"]
-        tests = [pack([*tokens, ">= 0"], "    and ", "        ", WIDTH - 12) for tokens in sums]
+        tests = [pack([*tokens, f">= {zero}"], "    and ", "        ", WIDTH - 12) for tokens in sums]
         tests[0][0] = tests[0][0].replace("and ", "    ", 1)
         return [f"{word} (", *(part for test in tests for part in test), "):"]
+
+    def _tokens(self, constant: float, weights: Sequence[float]) -> list[str]:
+        """A sum over X, of a program that is written as by hand."""
+        terms = zip(weights, self._variables(), strict=True)
+        return sum_tokens(number(constant), [term for term in terms if term[0]])
 
     def visit_controller(self, controller: Controller, index: int) -> list[str]:
         lines = self._controller(controller, index)
@@ -249,9 +254,8 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
         if condition.cell == "affine":
             return self._affine([_Row(f"b{index}", condition.readout_bias, condition.readout)], f"CONDITION_{index}")
         if condition.cell == "min":
-            sums = [_Row(f"m{index}_{place}", *one) for place, one in enumerate(condition.sums, start=1)]
-            least = pack(separated(row.name for row in sums), f"b{index} = min((", "    ", WIDTH - 12)
-            return [*self._affine(sums, f"CONDITION_{index}"), *least[:-1], f"{least[-1]}))"]
+            sums = [_Row(name, *one) for name, one in zip(_sum_names(condition, index), condition.sums, strict=True)]
+            return self._affine(sums, f"CONDITION_{index}")
         hidden = [f"h{index}_{unit + 1}" for unit in range(condition.hidden_size)]
         gates = [f"{gate}{index}_{unit + 1}" for gate, unit in gate_names(condition)]
         if condition.cell == "rnn":
@@ -380,6 +384,11 @@ def _weights_of_inputs(program: ProgramData) -> list[Sequence[float]]:
     for condition in program.conditions:
         rows += [weights for _, weights in condition.sums] or condition.weight_ih
     return rows
+
+
+def _sum_names(condition: Condition, index: int) -> list[str]:
+    """The variables of the sums of a condition."""
+    return [f"m{index}_{place}" for place in range(1, len(condition.sums) + 1)]
 
 
 def _named(variable: str, source: str, name: str) -> str:

@@ -37,9 +37,9 @@ def export_text(program: ProgramData, decimals: int = 2, max_terms: int | None =
     """Print a program as an indented if-then-else that a person can read.
 
     The terms of every sum stand in order of size. Those that round to zero or come after ``max_terms`` are only
-    counted. A condition without memory stands in the line of its branch, and several numbers of a Box action in one
-    line, where they fit. Whole numbers are printed without a point, so that ``3`` is exact and ``3.00`` is rounded.
-    :func:`export_python` and the saved file hold all numbers in full.
+    counted. An affine condition stands in the line of its branch, and several numbers of a Box action in one line,
+    where they fit; a min of several sums takes as many lines as it needs. Whole numbers are printed without a point, so
+    that ``3`` is exact and ``3.00`` is rounded. :func:`export_python` and the saved file hold all numbers in full.
 
     :param program: what to print
     :param decimals: digits after the point
@@ -95,7 +95,7 @@ class _TextPrinter(ProgramVisitor[list[str]]):
                 * (n_conditions > 1)
             ),
             *(
-                ["A min is not below 0 where all of its sums are not."]
+                ["A min is the least of its sums: it holds where none of them is below 0."]
                 * any(condition.cell == "min" for condition in program.conditions)
             ),
         ]

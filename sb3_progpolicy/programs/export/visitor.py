@@ -105,7 +105,7 @@ def _by_size(term: tuple[float, str]) -> float:
 
 def input_importance(condition: Condition) -> tuple[float, ...]:
     """How much each number of X can move a condition: its absolute weights into the units, each times the absolute
-    weight of that unit in B, summed.
+    weight of that unit in B, summed; without memory its absolute weights in all sums.
     """
     if not condition.remembers:
         return tuple(sum(map(abs, column)) for column in zip(*(weights for _, weights in condition.sums), strict=True))
