@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sb3_progpolicy.imitation.decision_list import Data, DecisionList
 from sb3_progpolicy.imitation.losses import Loss
@@ -54,6 +55,7 @@ def fine_tune(
     parameters = [conditions, controllers] if len(scaled) else [controllers]
     masks = [(parameter != 0).float() for parameter in parameters]
     optimizer = th.optim.Adam(parameters, lr=learning_rate)
+    places = _places_of_sums(program)
     first, last = temperatures
     for step in range(n_steps):
         done = step / n_steps
@@ -62,7 +64,9 @@ def fine_tune(
         rows = th.randint(len(data), (batch_size,), generator=generator)
         outputs = th.einsum("nd,kod->nko", inputs[rows], controllers)
         losses = loss.expected(outputs, targets[rows])
-        values = _least(inputs[rows] @ conditions.T, program)
+        values = inputs[rows] @ conditions.T
+        if places:
+            values = th.stack([values[:, place].amin(dim=1) for place in places], dim=1)
         chances = branch_chances(values / (first * (last / first) ** done))
         objective = ((chances * losses).sum(dim=1) * weights[rows]).mean()
         optimizer.zero_grad()
@@ -79,14 +83,11 @@ def fine_tune(
     )
 
 
-def _least(sums: th.Tensor, program: DecisionList) -> th.Tensor:
-    """Return the least sum of each condition, ``(n, n_conditions)``, for all sums ``(n, n_sums)``."""
-    import torch as th
-
+def _places_of_sums(program: DecisionList) -> list[NDArray[np.intp]]:
+    """Return the indices of the sums of each condition; none if each condition is one sum."""
     if len(program.owners) < program.n_branches:
-        return sums
-    places = [np.flatnonzero(program.owners == condition) for condition in range(program.n_branches - 1)]
-    return th.stack([sums[:, place].amin(dim=1) for place in places], dim=1)
+        return []
+    return [np.flatnonzero(program.owners == condition) for condition in range(program.n_branches - 1)]
 
 
 def branch_chances(values: th.Tensor) -> th.Tensor:

@@ -237,7 +237,7 @@ class _Cell:
     def step(self, gates: Floats) -> Floats:
         """Advance the state by the gates' share of X ``(n_envs, n_rows)`` and return B ``(n_envs,)``."""
         if self.size == 0:
-            return np.asarray(gates.min(axis=1))
+            return gates[:, 0] if self.cell == "affine" else np.asarray(gates.min(axis=1))
         joined = _accumulate(gates, self.joined_columns, self.h)
         apart = _accumulate(self.hidden_bias, self.apart_columns, self.h)
         self.h, self.c = STEPS[self.cell](joined, apart, self.h, self.c, _tanh)

@@ -80,6 +80,11 @@ class Condition:
         return self.cell not in STATELESS
 
     @property
+    def rows(self) -> Matrix:
+        """The weights of X in each sum, ``(n_sums, n_inputs)``: of B, of the sums of a min, or of a cell's gates."""
+        return tuple(weights for _, weights in self.sums) or self.weight_ih
+
+    @property
     def sums(self) -> tuple[tuple[float, Vector], ...]:
         """Constant and weights of each affine sum over X whose least one is B; none of a condition with a state."""
         if self.cell == "affine":
@@ -143,5 +148,5 @@ def inputs_read(program: ProgramData) -> set[int]:
     """Return the indices of the inputs that a program reads: those with a weight that is not zero."""
     rows = [row for controller in program.controllers for row in controller.weights]
     for condition in program.conditions:
-        rows += [weights for _, weights in condition.sums] or condition.weight_ih
+        rows += condition.rows
     return {index for row in rows for index, weight in enumerate(row) if weight}

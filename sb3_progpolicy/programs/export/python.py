@@ -382,7 +382,7 @@ def _weights_of_inputs(program: ProgramData) -> list[Sequence[float]]:
     """The weights of X in every sum of a program."""
     rows: list[Sequence[float]] = [row for controller in program.controllers for row in controller.weights]
     for condition in program.conditions:
-        rows += [weights for _, weights in condition.sums] or condition.weight_ih
+        rows += condition.rows
     return rows
 
 
