@@ -49,15 +49,17 @@ class Thinner:
     def __init__(self, program: ProgramData, states: States, symmetries: Sequence[Any]) -> None:
         self.program = program
         self.controllers = {int(branch): matrix_of(program.controllers[branch]) for branch in set(states.branches)}
-        last = max(self.controllers)
+        *others, _ = sorted(self.controllers)
+        kept = {index: program.conditions[index] for index in others}
         self.conditions = {
             index: np.array([[*condition.readout, condition.readout_bias]])
-            for index, condition in enumerate(program.conditions)
-            if condition.cell == "affine" and index in self.controllers and index < last
+            for index, condition in kept.items()
+            if condition.cell == "affine"
         }
+        rows = [row for condition in kept.values() for row in _rows(condition)]
         tied = all(
             np.allclose(matrix, symmetric_part(program, matrix, symmetries), atol=1e-6 * max(1.0, np.abs(matrix).max()))
-            for matrix in (*self.controllers.values(), *self.conditions.values())
+            for matrix in (*self.controllers.values(), *rows)
         )
         #: Whether a number stands for all that a symmetry ties to it.
         self.tied = tied and bool(symmetries)
@@ -115,6 +117,11 @@ class Thinner:
             conditions = {index: rounded(matrix, digits) for index, matrix in conditions.items()}
         changed = {index: _with(self.program.conditions[index], matrix) for index, matrix in conditions.items()}
         return with_branches(self.program, controllers, changed)
+
+
+def _rows(condition: Condition) -> list[Floats]:
+    """Return each sum over X of a condition, ``(1, n_inputs + 1)``; no symmetry moves the constant, here 0."""
+    return [np.array([[*weights, 0.0]]) for weights in condition.rows]
 
 
 def _with(condition: Condition, matrix: Floats) -> Condition:

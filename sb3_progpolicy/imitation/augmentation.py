@@ -66,14 +66,13 @@ AUGMENTATIONS: dict[str, Callable[[Sequence[str]], Augment]] = {"taller_towers":
 #: Begins an episode of an environment, by a seed and a variation, in another way than ``reset``; the observation.
 Begin = Callable[[Any, int, Mapping[str, Any]], Observations]
 _MOST_BEGUN, _MOST_BELOW = 5, 4  # blocks of a tower; of those over which the gripper's neutral place is
-_MOST_OBJECTS = 8  # of PandaStack
 
 
 def begun_towers(env: Any, seed: int, variation: Mapping[str, Any]) -> Observations:
     """Begin an episode of PandaStack, in half of the cases with a tower of one to five other blocks.
 
     The hand is then at its neutral place or, in half of these cases and over towers of five, where it has just put the
-    last block down. There are eight blocks at most.
+    last block down. There are never more blocks than the environment can have.
 
     :param env: the environment
     :param seed: of the episode
@@ -84,7 +83,7 @@ def begun_towers(env: Any, seed: int, variation: Mapping[str, Any]) -> Observati
         raise ValueError("augment='begun_towers' is not accepted: only PandaStack has towers")
     rng = np.random.default_rng((seed, 1))
     n_objects = variation.get("n_objects", 1)
-    most = max(min(_MOST_BEGUN, _MOST_OBJECTS - n_objects), 0)
+    most = max(min(_MOST_BEGUN, env.unwrapped.variations["n_objects"].high - n_objects), 0)
     n_done = 0 if rng.random() < 0.5 else int(rng.integers(min(most, 1), most + 1))
     above = n_done > 0 and (n_done > _MOST_BELOW or rng.random() < 0.5)
     options = {**variation, "n_objects": n_objects + n_done, "n_done": n_done if above else 0}

@@ -275,6 +275,25 @@ def test_all_numbers_make_the_original_and_ties_are_kept():
     assert not Thinner(untied, states, symmetries).tied
 
 
+@pytest.mark.parametrize("cell", ["affine", "min", "gru"])
+def test_a_condition_that_no_symmetry_ties_unties_the_program(cell):
+    original, symmetries = right_hand(0.2), DOMAINS["HikingEgo-v0"].symmetries
+    n_inputs = original.n_inputs
+    states = States(np.ones((2, n_inputs + 1)), np.array([0, 1]))
+
+    def thinner(weights):
+        condition = {
+            "affine": Condition("affine", (), (), (), (), weights, 0.1),
+            "min": Condition("min", (weights,), (), (0.1,), (), (), 0.0),
+            "gru": Condition("gru", (weights,) * 3, ((0.0,),) * 3, (0.0,) * 3, (0.0,) * 3, (1.0,), 0.1),
+        }[cell]
+        body = IfThenElse(condition, original.body, original.body)
+        return Thinner(dataclasses.replace(original, body=body), states, symmetries)
+
+    assert thinner((0.0,) * n_inputs).tied
+    assert not thinner((1.0,) + (0.0,) * (n_inputs - 1)).tied
+
+
 def test_conditions_are_thinned_and_branches_that_never_act_go():
     original = load_pretrained("Hiking-v0")
     states, _ = visited(original, "Hiking-v0", [{"n_stars": 1}] * 4, 5, seed=0)
