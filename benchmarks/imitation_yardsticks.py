@@ -6,7 +6,7 @@ The students are a decision tree with as many leaves as a program has branches, 
 layers of 64 units, all from scikit-learn, in twelve rounds of DAgger (without the weights of VIPER, Bastani et al.
 2018, which need the teacher's values). Needs the extra ``sizes``.
 
-Writes ``benchmarks/results/<name>.csv`` and a ``.json`` with command, commit and versions.
+Writes ``benchmarks/results/<name>.csv`` after each student, and a ``.json`` with command, commit and versions.
 """
 
 from __future__ import annotations
@@ -47,7 +47,9 @@ def students(n_branches: int, seed: int) -> dict[str, Callable[[], Any]]:
     return {
         f"tree of {n_branches} leaves": lambda: DecisionTreeRegressor(max_leaf_nodes=n_branches, random_state=seed),
         "tree of depth 8": lambda: DecisionTreeRegressor(max_depth=8, min_samples_leaf=5, random_state=seed),
-        "network 64-64": lambda: MLPRegressor((64, 64), early_stopping=True, max_iter=100, random_state=seed),
+        "network 64-64": lambda: MLPRegressor(
+            hidden_layer_sizes=(64, 64), early_stopping=True, max_iter=100, random_state=seed
+        ),
     }
 
 
@@ -101,6 +103,9 @@ def main() -> None:
     assert find_domain(options.env) is not None, f"{options.env} has no planner"
     wanted = wanted_variations(options.env, options.final, options.sizes)
     learned = "imitation" + (f", {options.augment}" if options.augment else "")
+    file = f"imitation_yardsticks_{options.env.rpartition('-')[0].lower()}"
+    file += f"_{options.augment}" if options.augment else ""
+    arguments = {"n_timesteps": options.n_timesteps, "augment": options.augment}
     rows = []
     pool, visited = Pool(options.env, _N_ENVS), Pool(options.env, _N_ENVS, begin=make_starts(options.augment))
     for name, make in students(options.branches, options.seed).items():
@@ -112,12 +117,9 @@ def main() -> None:
             about = {"student": name, "learned_by": learned, "set": kind, "cpu_seconds": seconds}
             rows.append({**about, **_row(variation, played)})
             print(rows[-1])
+        write_results(file, COLUMNS, rows, arguments, ["scikit-learn"])
     pool.close()
     visited.close()
-    file = f"imitation_yardsticks_{options.env.rpartition('-')[0].lower()}"
-    file += f"_{options.augment}" if options.augment else ""
-    arguments = {"n_timesteps": options.n_timesteps, "augment": options.augment}
-    write_results(file, COLUMNS, rows, arguments, ["scikit-learn"])
 
 
 if __name__ == "__main__":
