@@ -35,6 +35,7 @@ CELLS = ("affine", "min", *RECURRENT_CELLS)
 #: Sums of a condition at most, if ``cell="min"``.
 MAX_SUMS = 3
 N_ROUNDS, N_PLAIN_ROUNDS, N_SPARSE_ROUNDS = 9, 10, 3
+_N_BRIEF_ROUNDS = 6  # in place of N_ROUNDS, where plain lists are what is asked for
 _CHANGED = 0.02  # share of the actions, or mean distance, that rounding may change
 _DIGITS = (2, 3, 4, 6)
 #: Inputs that are not read by default: beyond the training sizes they take values that were never seen.
@@ -198,11 +199,12 @@ class _Run:
         self.n_labelled = 0
         #: Teachers with continuous actions may be made of pieces.
         self.n_plain_rounds = N_PLAIN_ROUNDS if self.spec.kind == "box" else 0
+        self.n_dense_rounds = min(N_ROUNDS, _N_BRIEF_ROUNDS) if settings.max_sums > 1 else N_ROUNDS
 
     @property
     def n_rounds(self) -> int:
         """Number of rounds at most."""
-        return N_ROUNDS + self.n_plain_rounds + N_SPARSE_ROUNDS
+        return self.n_dense_rounds + self.n_plain_rounds + N_SPARSE_ROUNDS
 
     def n_rows(self, n_states: int) -> int:
         """Return in how many environments so many states are visited, so that each sees whole episodes."""
@@ -240,7 +242,7 @@ class _Run:
         first = 0
         if checkpoint is not None and checkpoint.exists():
             first = self._restore(load_state(checkpoint, origin))
-        self.judge.final = first >= N_ROUNDS
+        self.judge.final = first >= self.n_dense_rounds
         total = self.n_rounds
         for number in range(first, total):
             self._round(number, n_steps)
@@ -316,7 +318,7 @@ class _Run:
 
     def _round(self, number: int, n_steps: int) -> None:
         learner, selection = self.learner, self.selection
-        n_before_sparse = N_ROUNDS + self.n_plain_rounds
+        n_before_sparse = self.n_dense_rounds + self.n_plain_rounds
         if learner.n_states:
             self.collector.stalls.deviations = deviations = learner.observations.std(axis=0)
             if self.judge.patience is not None:
@@ -324,18 +326,18 @@ class _Run:
         # Plain lists learn from the episodes that they were judged by.
         if number >= n_before_sparse or not selection.plain:
             self._visit(number, n_steps)
-        if number < N_ROUNDS - 1:
+        if number < self.n_dense_rounds - 1:
             for candidate in learner.fit(number):
-                if number >= N_ROUNDS // 2 - 1:
+                if number >= self.n_dense_rounds // 2 - 1:
                     selection.offer(candidate)
             return
-        if number == N_ROUNDS - 1:
+        if number == self.n_dense_rounds - 1:
             for candidate in learner.finish():
                 selection.offer(candidate)
             selection.choose_finally()
         if number < n_before_sparse:
             is_last = number == n_before_sparse - 1
-            selection.make_plain(number - N_ROUNDS + 2, 0 if is_last else n_steps * len(self.collector.pool))
+            selection.make_plain(number - self.n_dense_rounds + 2, 0 if is_last else n_steps * len(self.collector.pool))
             if is_last:
                 selection.choose_plain()
                 if not selection.is_plain:

@@ -226,23 +226,26 @@ def logistic(
     penalty = np.full(width, ridge * n)
     penalty[-1] *= 1e-2
 
-    def objective(candidate: Floats) -> float:
-        values = inputs @ candidate
+    def objective(candidate: Floats, values: Floats) -> float:
         return float((costs * (np.logaddexp(0, values) - wanted * values)).sum() + 0.5 * penalty @ candidate**2)
 
-    value = objective(weights)
+    values = inputs @ weights
+    value = objective(weights, values)
     for _ in range(iterations):
-        chances = _sigmoid(inputs @ weights)
+        chances = _sigmoid(values)
         gradient = inputs.T @ (costs * (chances - wanted)) + penalty * weights
         curvature = costs * np.maximum(chances * (1 - chances), 1e-4)
         step = np.linalg.solve((inputs * curvature[:, None]).T @ inputs + np.diag(penalty), gradient)
-        length = 1.0
-        while length > 1e-3 and objective(weights - length * step) >= value:
+        length, before = 1.0, value
+        while length > 1e-3:
+            moved = weights - length * step
+            values = inputs @ moved
+            if (value := objective(moved, values)) < before:
+                break
             length *= 0.5
-        if length <= 1e-3:
+        else:
             break
-        weights = weights - length * step
-        before, value = value, objective(weights)
+        weights = moved
         if before - value < 1e-4 * abs(before):
             break
     return weights
