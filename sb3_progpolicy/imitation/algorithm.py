@@ -76,7 +76,7 @@ def imitate(
     ignore: Sequence[str] = IGNORED,
     score_tolerance: float = 0.015,
     plain_tolerance: float = 0.05,
-    n_episodes: int = 24,
+    n_episodes: int | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     augment: str | Augment | None = None,
     callback: Callable[[Imitation], None] | None = None,
@@ -111,7 +111,8 @@ def imitate(
     :param score_tolerance: share of the score that fewer and rounder numbers may cost
     :param plain_tolerance: share of the score that a plain program may cost, which a person can read; 0 takes it only
         if it is at least as good as the list that all inputs are open to
-    :param n_episodes: of each validation, on training variations; the last ones have twice as many
+    :param n_episodes: of each validation, on training variations; the last ones have twice as many. By default 24, or
+        96 where there is no goal (no ``is_success`` in ``info``), since returns vary more than successes
     :param env_kwargs: constructor arguments of the environment
     :param augment: makes states that were not visited, which the teacher labels too: a function from observations and
         a generator to observations, or ``"taller_towers"`` for PandaStack; ``"begun_towers"`` begins half of its
@@ -134,7 +135,7 @@ def imitate(
             "state that was not visited has no past, and the state of such an imitation is not kept"
         )
     n_shares = N_ROUNDS + 1 + N_PLAIN_ROUNDS + N_SPARSE_ROUNDS  # the first round has two
-    if n_timesteps < n_shares * n_envs or max_conditions < 0 or n_episodes < 1:
+    if n_timesteps < n_shares * n_envs or max_conditions < 0 or (n_episodes is not None and n_episodes < 1):
         raise ValueError(
             f"n_timesteps={n_timesteps}, max_conditions={max_conditions}, n_episodes={n_episodes} are not accepted; "
             f"at least {n_shares * n_envs} (for n_envs={n_envs}), 0 and 1 are"
@@ -169,7 +170,7 @@ class _Run:
         tasks: Variations | None,
         settings: Settings,
         ignore: Sequence[str],
-        n_episodes: int,
+        n_episodes: int | None,
         tolerances: tuple[float, float],
         augment: str | Augment | None,
     ) -> None:

@@ -9,6 +9,7 @@ from sb3_progpolicy.imitation.teachers import Teacher
 #: Of the first episode; no episode of the training has a seed near it.
 VALIDATION_SEED = 50_000_000
 _FEW_OF, _HOPELESS = 3, 14.0  # of so many episodes one comes first; times the tolerance that these may be below
+_WITH_GOAL, _WITHOUT_GOAL = 24, 96  # episodes of a validation: returns vary more than successes
 _BEFORE_SERIES = 7  # times the number of episodes: those of all other scores
 
 
@@ -17,15 +18,21 @@ class Judge:
 
     :param pool: environments to play in
     :param variations: to play on, in turn
-    :param n_episodes: of each validation; the last ones have twice as many
+    :param n_episodes: of each validation; the last ones have twice as many. ``None`` for 24, or 96 without a goal
     :param tolerance: share of the score within which another one is as good
     :param teacher: whose steps are the unit of steps
     """
 
-    def __init__(self, pool: Pool, variations: Variations, n_episodes: int, tolerance: float, teacher: Teacher) -> None:
-        self.pool, self.variations, self.n_episodes, self.tolerance = pool, variations, n_episodes, tolerance
+    def __init__(
+        self, pool: Pool, variations: Variations, n_episodes: int | None, tolerance: float, teacher: Teacher
+    ) -> None:
+        self.pool, self.variations, self.tolerance = pool, variations, tolerance
         self.teacher = teacher
-        self.teacher_episodes = play(pool, variations, n_episodes, VALIDATION_SEED, None, teacher)
+        self.teacher_episodes = play(pool, variations, n_episodes or _WITH_GOAL, VALIDATION_SEED, None, teacher)
+        self.n_episodes = n_episodes or (_WITH_GOAL if len(self.teacher_episodes.successes) else _WITHOUT_GOAL)
+        if more := self.n_episodes - len(self.teacher_episodes.returns):
+            seed = VALIDATION_SEED + self.n_episodes - more
+            self.teacher_episodes = self.teacher_episodes.and_then(play(pool, variations, more, seed, None, teacher))
         #: Whether episodes are those of the last validations, which nothing was chosen by before.
         self.final = False
         #: What ends an episode that is lost; ``None`` if all run to their end.

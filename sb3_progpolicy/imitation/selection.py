@@ -21,6 +21,7 @@ _FINALISTS = 3
 _RARE, _DROPS = 0.03, 5  # share of the states in which a rare branch acts; how many are tried without
 _NEAR, _LOSS = 1.3, 0.01  # a list whose loss is so many times the best one's, and more, is not looked at
 _AGAIN = 2  # of the best plain lists play new episodes in each round, and have lists made of them
+_TRIES = 3  # rounds in which pieces are looked for, if none explain the states
 _SHORT = (7, 4, 2, 1)  # numbers of branches that are tried at the end
 
 
@@ -93,6 +94,8 @@ class Selection:
             soon be best there alone
         :param n_states: to label
         """
+        if series > _TRIES and not self.plain:
+            return
         candidates = self.learner.plain([plain.candidate for plain in self.plain[:_AGAIN]], anew=series % 2 == 0)
         if not candidates:
             return

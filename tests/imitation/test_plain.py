@@ -284,6 +284,34 @@ def test_next_plain_list_is_made_of_the_one_of_the_best_episodes_and_is_seen_to_
     np.testing.assert_allclose(targets, labels)
 
 
+def test_pieces_that_explain_nothing_are_looked_for_in_three_rounds_only():
+    class NoPieces:
+        asked = 0
+
+        def plain(self, known, anew):
+            self.asked += 1
+            return []
+
+    with Pool("PandaReach-v0", 2) as pool:
+        judge = Judge(pool, [{"n_targets": 1}], 2, 0.015, make_teacher("planner", pool.envs[0]))
+    selection = Selection(NoPieces(), judge, (), None, None, 0.05)
+    for series in range(1, 11):
+        selection.make_plain(series, 50)
+    assert selection.learner.asked == 3
+
+
+@pytest.mark.parametrize(
+    ("env_id", "variation", "expected"), [("Hanoi-v0", {"n_discs": 1}, 24), ("CartPole-v1", {}, 96)]
+)
+def test_where_there_is_no_goal_more_episodes_compare_candidates(env_id, variation, expected):
+    with Pool(env_id, 12) as pool:
+        teacher = make_teacher("planner" if variation else lambda seen: (seen[:, 2] > 0).astype(np.int64), pool.envs[0])
+        judge = Judge(pool, [variation], None, 0.015, teacher)
+        at_once = play(pool, [variation], expected, judge_module.VALIDATION_SEED, None, teacher)
+    assert judge.n_episodes == expected
+    np.testing.assert_array_equal(judge.teacher_episodes.returns, at_once.returns)
+
+
 def test_last_comparison_plays_few_episodes_with_what_is_far_worse(monkeypatch):
     with Pool("PandaReach-v0", 4) as pool:
         judge = Judge(pool, [{"n_targets": 1}], 6, 0.015, make_teacher("planner", pool.envs[0]))
