@@ -11,7 +11,7 @@ import torch as th
 from sb3_contrib.ppo_recurrent import MlpLstmPolicy
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 
 from sb3_progpolicy.extraction import env_id_of, extract_program, wrappers_of
 from sb3_progpolicy.interaction import program_names
@@ -62,8 +62,8 @@ class ReptilePPO(StoredPPO):
 
     :param policy: ``"ProgPolicy"``, ``"PRLPolicy"``, ``"MlpPolicy"``, ``"MlpLstmPolicy"`` or a policy class
     :param env: an environment id (the fastest vectorised form is built), an environment or a ``VecEnv``
-    :param learning_rate: of the inner updates (Adam), a number or a schedule of the remaining progress; by default 0.02
-        for a program, which is nearly linear in its parameters and takes large steps, and 0.0003 for a network
+    :param learning_rate: of the inner updates (Adam), a number or a schedule of the remaining progress. By default it
+        falls from 0.02 to 0 for a program, which is nearly linear and takes large steps, and is 0.0003 for a network
     :param n_steps: steps of a rollout, per environment
     :param batch_size: transitions per gradient step; recurrent policies take ``batch_size / n_steps`` whole sequences,
         or, where ``batch_size`` is smaller, sequences of ``batch_size`` steps, or, with a warning, of the next smaller
@@ -204,7 +204,7 @@ class ReptilePPO(StoredPPO):
         if batch_size is None:
             batch_size = default_batch_size(n_steps, 1 if venv is None else venv.num_envs, learns_program)
         if learning_rate is None:
-            learning_rate = 2e-2 if learns_program else 3e-4
+            learning_rate = LinearSchedule(2e-2, 0.0, 1.0) if learns_program else 3e-4
         if normalize_observations is None:
             normalize_observations = learns_program and init_program is None
         self._initial_program, self.learned_by = read_initial_program(init_program), LEARNED_BY[0]

@@ -102,3 +102,11 @@ def test_environments_that_are_made_already_take_no_arguments():
 def test_a_network_is_no_program():
     with pytest.raises(TypeError, match="is not a program"):
         make("MlpPolicy").program()
+
+
+@pytest.mark.parametrize(("policy", "ends"), [("ProgPolicy", (0.02, 0.0)), ("MlpPolicy", (3e-4, 3e-4))])
+def test_learning_rate_of_a_program_falls_to_zero_by_default(policy, ends, tmp_path):
+    model = ReptilePPO(policy, "CartPole-v1", n_envs=2, n_steps=8)
+    model.save(tmp_path / "model.zip")
+    for one in (model, ReptilePPO.load(tmp_path / "model.zip")):
+        assert (one.lr_schedule(1.0), one.lr_schedule(0.0)) == ends

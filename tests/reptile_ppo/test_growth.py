@@ -162,10 +162,8 @@ def test_condition_that_is_taken_back_leaves_no_trace(monkeypatch, short):
     """The twin was trained on the same tasks as without any trial, with the same numbers of random."""
     keep(monkeypatch, False)
     stop = {"callback": Stop(lambda model: model.meta_iteration == 7)}  # an iteration that is stopped ends there
-    tried, plain = (
-        make(**GROWTH, meta_optimizer="adam", meta_learning_rate=0.05, search_fraction=fraction).learn(10**6, **stop)
-        for fraction in (1.0, 0.0)
-    )
+    same = {"learning_rate": 0.02, "meta_optimizer": "adam", "meta_learning_rate": 0.05}  # whatever steps a trial takes
+    tried, plain = (make(**GROWTH, **same, search_fraction=fraction).learn(10**6, **stop) for fraction in (1.0, 0.0))
     assert len(tried.growth.trials) == 1
     assert not plain.growth.trials
     assert th.equal(weights(tried), weights(plain))
