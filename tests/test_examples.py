@@ -64,7 +64,7 @@ def test_demo_prints_a_table_and_writes_program_picture_and_film(tmp_path):
 
 
 def test_distilled_network_is_printed_and_exported(tmp_path):
-    output = run("distill_sb3_model.py", tmp_path, "--states", "1000")
+    output = run("distill_sb3_model.py", tmp_path, "--episodes", "12", "--states", "1000")
     assert "Program for CartPole-v1" in output
     assert "of the actions are the same" in output
     assert (tmp_path / "policy.py").exists()
