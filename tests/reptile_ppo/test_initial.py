@@ -280,9 +280,9 @@ def test_program_whose_weights_need_not_be_tied_is_refused():
 
 
 def test_number_of_conditions_is_that_of_the_program():
-    program = load_pretrained("PandaStack-v0")
+    program = load_pretrained("PandaSlide-v0")
     kwargs = {"n_conditions": 5, "cell": "affine"}
     model = make(
-        "PRLPolicy", "PandaStack-v0", n_envs=1, interaction_history=False, init_program=program, policy_kwargs=kwargs
+        "PRLPolicy", "PandaSlide-v0", n_envs=1, interaction_history=False, init_program=program, policy_kwargs=kwargs
     )
     assert len(model.program().conditions) == len(program.conditions) != 5
