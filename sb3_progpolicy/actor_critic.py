@@ -44,8 +44,8 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
     :param action_space: of the environment
     :param lr_schedule: learning rate schedule
     :param depth: layers of the derivation graph, at least 1; programs have up to ``depth - 1`` conditions
-    :param cell: ``"gru"``, ``"lstm"``, ``"rnn"`` or ``"affine"``
-    :param condition_size: hidden units per condition
+    :param cell: ``"gru"``, ``"lstm"``, ``"rnn"``, ``"affine"``, or ``"min"``, the least of several affine sums
+    :param condition_size: hidden units per condition, or sums of a ``"min"``
     :param temperature: of the sigmoid in the soft semantics, above 0
     :param semantics: what a soft program does with Box actions: ``"branches"`` draws one controller, ``"means"`` mixes
         the controllers' outputs, as in the paper; discrete actions are drawn either way

@@ -12,6 +12,7 @@ from torch import nn
 
 from sb3_progpolicy.actor_critic import DERIVATION_LR_SCALE, ProgrammaticActorCritic
 from sb3_progpolicy.differentiable.conditions import Conditions, State
+from sb3_progpolicy.programs.syntax import STATELESS
 
 __all__ = ["DERIVATION_LR_SCALE", "ProgrammaticActorCritic", "ProgrammaticPolicy", "RecurrentProgrammaticPolicy"]
 
@@ -94,14 +95,14 @@ class RecurrentProgrammaticPolicy(ProgrammaticActorCritic, RecurrentActorCriticP
 class ProgrammaticPolicy(ProgrammaticActorCritic):
     """The policy ``"PRLPolicy"``: a program with affine conditions, for SB3's ``PPO`` (PRL, Qiu and Zhu, 2022).
 
-    See :class:`ProgrammaticActorCritic` for the arguments; ``cell`` is ``"affine"``.
+    See :class:`ProgrammaticActorCritic` for the arguments; ``cell`` is ``"affine"``, or ``"min"``.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        if kwargs.setdefault("cell", "affine") != "affine":
+        if kwargs.setdefault("cell", "affine") not in STATELESS:
             raise ValueError(
-                f"cell={kwargs['cell']!r} is not accepted; 'affine' is, and recurrent cells (gru, lstm, rnn) are those "
-                "of RecurrentProgrammaticPolicy"
+                f"cell={kwargs['cell']!r} is not accepted; 'affine' and 'min' are, and recurrent cells (gru, lstm, rnn) "
+                "are those of RecurrentProgrammaticPolicy"
             )
         super().__init__(*args, **kwargs)
 

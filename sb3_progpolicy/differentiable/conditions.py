@@ -1,4 +1,4 @@
-"""The conditions of a program: all of them in one recurrent, or affine, layer."""
+"""The conditions of a program: all of them in one recurrent layer, or in one affine layer."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import torch as th
 from torch import nn
 
 from sb3_progpolicy.differentiable.recurrence import scan
-from sb3_progpolicy.programs.syntax import GATES, Cell, Condition
+from sb3_progpolicy.programs.syntax import GATES, STATELESS, Cell, Condition
 
 State = tuple[th.Tensor, th.Tensor]
 
 _LAYERS: dict[Cell, Callable[[int, int], nn.RNNBase]] = {"rnn": nn.RNN, "gru": nn.GRU, "lstm": nn.LSTM}
 _OF_INPUTS = ("rnn.weight_ih_l0", "affine.weight")
-CELLS: tuple[Cell, ...] = ("affine", *_LAYERS)
+CELLS: tuple[Cell, ...] = (*STATELESS, *_LAYERS)
 
 
 class Conditions(nn.Module):
-    """All conditions ``B_1 ... B_K`` of a program in one recurrent layer.
+    """All conditions ``B_1 ... B_K`` of a program in one layer.
 
     The recurrent matrix is block-diagonal: entries between the units of different conditions are zero and get no
     gradient, so that each condition has a state of its own while one fused kernel computes them all.
@@ -29,8 +29,8 @@ class Conditions(nn.Module):
 
     :param n_inputs: length of X
     :param n_conditions: K, 0 or more
-    :param cell: ``"gru"``, ``"lstm"``, ``"rnn"``, or ``"affine"`` for conditions without a state
-    :param size: hidden units per condition, at least 1
+    :param cell: ``"gru"``, ``"lstm"``, ``"rnn"``, or for conditions without a state ``"affine"`` or ``"min"``
+    :param size: hidden units per condition, or affine sums of a ``"min"``, at least 1
     :param projection: ``(n_inputs, n_inputs)``, applied to X first, such as the mean over a group of symmetries, which
         makes every condition the same for all members; ``None`` for none
     """
@@ -48,7 +48,7 @@ class Conditions(nn.Module):
         if size < 1:
             raise ValueError(f"condition size {size} is not accepted; it is at least 1")
         self.input_size, self.n_conditions, self.cell, self.size = n_inputs, n_conditions, cell, size
-        self.recurrent = cell != "affine" and n_conditions > 0
+        self.recurrent = cell not in STATELESS and n_conditions > 0
         # SB3 keeps states as arrays of this width; it cannot be 0.
         self.hidden_size = n_conditions * size if self.recurrent else 1
         if self.recurrent:
@@ -57,7 +57,12 @@ class Conditions(nn.Module):
             self.readout = nn.Parameter(th.ones(n_conditions, size) / size**0.5)
             self.readout_bias = nn.Parameter(th.zeros(n_conditions))
         elif n_conditions:
-            self.affine = nn.Linear(n_inputs, n_conditions)
+            self.affine = nn.Linear(n_inputs, n_conditions * self.n_sums)
+
+    @property
+    def n_sums(self) -> int:
+        """Affine sums of a condition without a state."""
+        return self.size if self.cell == "min" else 1
 
     def _make_block_diagonal(self) -> None:
         blocks = th.block_diag(*[th.ones(self.size, self.size)] * self.n_conditions)
@@ -85,7 +90,8 @@ class Conditions(nn.Module):
         if self.projection is not None:
             inputs = inputs @ self.projection
         if not self.recurrent:
-            return self.affine(inputs), state
+            sums = self.affine(inputs)
+            return sums if self.n_sums == 1 else sums.unflatten(-1, (self.n_conditions, self.n_sums)).amin(-1), state
         if self.cell == "lstm":
             hidden, state = self.rnn(inputs, state)
         elif inputs.device.type == "cpu" and inputs.dtype == th.float32:
@@ -104,25 +110,29 @@ class Conditions(nn.Module):
 
     @property
     def input_weight(self) -> th.Tensor:
-        """The weights of X, ``(n_gates * hidden_size or n_conditions, n_inputs)``, with the projection in them."""
+        """The weights of X, with the projection: ``(n_gates * hidden_size or n_conditions * n_sums, n_inputs)``."""
         weight = cast(th.Tensor, self.rnn.weight_ih_l0 if self.recurrent else self.affine.weight)
         return weight if self.projection is None else weight @ self.projection
 
     def to_syntax(self, k: int) -> Condition:
-        """Return condition ``k`` (0-based) as plain data."""
+        """Return condition ``k`` (0-based) as plain data, of sums that are equal only one."""
         if not self.recurrent:
-            weight, bias = self.input_weight[k], self.affine.bias[k]
-            return Condition("affine", (), (), (), (), vector(weight), bias.item())
+            own = slice(k * self.n_sums, (k + 1) * self.n_sums)
+            rows = dict.fromkeys(zip(vector(self.affine.bias[own]), matrix(self.input_weight[own]), strict=True))
+            constants, weights = zip(*rows, strict=True)
+            if len(rows) == 1:
+                return Condition("affine", (), (), (), (), weights[0], constants[0])
+            return Condition("min", weights, (), constants, (), (), 0.0)
         n_gates = len(GATES[self.cell])
-        rows = slice(k * self.size, (k + 1) * self.size)
+        units = slice(k * self.size, (k + 1) * self.size)
 
         def gates(parameter: th.Tensor | nn.Module) -> th.Tensor:
-            return cast(th.Tensor, parameter).unflatten(0, (n_gates, self.hidden_size))[:, rows].flatten(0, 1)
+            return cast(th.Tensor, parameter).unflatten(0, (n_gates, self.hidden_size))[:, units].flatten(0, 1)
 
         return Condition(
             cell=self.cell,
             weight_ih=matrix(gates(self.input_weight)),
-            weight_hh=matrix(gates(self.rnn.weight_hh_l0)[:, rows]),
+            weight_hh=matrix(gates(self.rnn.weight_hh_l0)[:, units]),
             bias_ih=vector(gates(self.rnn.bias_ih_l0)),
             bias_hh=vector(gates(self.rnn.bias_hh_l0)),
             readout=vector(self.readout[k]),
@@ -135,15 +145,15 @@ class Conditions(nn.Module):
         A projection is then in the weights.
         """
         kept = Conditions(self.input_size, n_conditions, self.cell, self.size)
-        rows = slice(0, n_conditions * self.size)
+        units = slice(0, n_conditions * self.size)
         with th.no_grad():
             for name, parameter in kept.named_parameters():
                 source: th.Tensor = self.input_weight if name in _OF_INPUTS else self.get_parameter(name)
                 if name.startswith("rnn."):
-                    source = source.unflatten(0, (len(GATES[self.cell]), self.hidden_size))[:, rows].flatten(0, 1)
-                    source = source[:, rows] if name == "rnn.weight_hh_l0" else source
+                    source = source.unflatten(0, (len(GATES[self.cell]), self.hidden_size))[:, units].flatten(0, 1)
+                    source = source[:, units] if name == "rnn.weight_hh_l0" else source
                 else:
-                    source = source[:n_conditions]
+                    source = source[: len(parameter)]
                 parameter.copy_(source)
         return kept
 

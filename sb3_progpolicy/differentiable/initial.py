@@ -8,16 +8,21 @@ from typing import cast
 import torch as th
 
 from sb3_progpolicy.differentiable.module import Conditions, ProgramModule
-from sb3_progpolicy.programs.syntax import GATES, Condition, ProgramData
+from sb3_progpolicy.programs.syntax import GATES, STATELESS, Condition, ProgramData
 
 
 def shape_of(program: ProgramData) -> tuple[str, int] | None:
-    """Return the cell and the number of hidden units that all conditions of a program have.
+    """Return the cell and the size that all conditions of a program have: hidden units, or affine sums of a min.
+
+    Affine conditions are mins of one sum where others have more.
 
     :param program: well formed
     :return: ``None`` for a program without conditions
     :raises ValueError: if its conditions differ in them; a module computes all of its conditions in one layer
     """
+    cells = {condition.cell for condition in program.conditions}
+    if "min" in cells and cells <= set(STATELESS):
+        return "min", max(len(condition.sums) for condition in program.conditions)
     shapes = {(condition.cell, condition.hidden_size or 1) for condition in program.conditions}
     if len(shapes) > 1:
         named = ", ".join(f"{cell} of size {size}" for cell, size in sorted(shapes))
@@ -69,8 +74,12 @@ def put_program(module: ProgramModule, program: ProgramData) -> None:
 
 def _put_condition(conditions: Conditions, k: int, condition: Condition) -> None:
     if not conditions.recurrent:
-        _put(conditions.affine.weight[k], condition.readout)
-        conditions.affine.bias[k] = condition.readout_bias
+        # What has fewer sums than others has its last one several times; equal sums are trained alike.
+        for number in range(conditions.n_sums):
+            row = k * conditions.n_sums + number
+            constant, weights = condition.sums[min(number, len(condition.sums) - 1)]
+            _put(conditions.affine.weight[row], weights)
+            conditions.affine.bias[row] = constant
         return
     units = slice(k * conditions.size, (k + 1) * conditions.size)
     n_gates = len(GATES[conditions.cell])

@@ -37,7 +37,7 @@ class ProgramModule(nn.Module):
     :param action: the action space
     :param depth: layers of the derivation graph, at least 1; programs have 0 to ``depth - 1`` conditions
     :param cell: see :class:`Conditions`
-    :param condition_size: hidden units per condition
+    :param condition_size: see there, ``size``
     :param temperature: of the sigmoid, above 0; towards 0 the soft semantics becomes the crisp one
     :param semantics: of Box actions, ``"means"`` or ``"branches"``
     :param symmetries: generators of a group that is to leave the program as it is: all weights of a controller that are

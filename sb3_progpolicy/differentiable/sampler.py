@@ -170,8 +170,11 @@ class ProgramSampler:
         :param gates: the affine part of the conditions, ``(n_envs, n_gates * hidden_size)``
         :param out: ``(n_envs, n_conditions)``
         """
-        if not self.recurrent:
+        if not self.recurrent and gates.shape == out.shape:
             out[:] = gates
+            return
+        if not self.recurrent:
+            np.minimum.reduce(gates.reshape(len(gates), self.n_conditions, self.size), axis=-1, out=out)
             return
         recurrent = self._hidden @ self._weight
         recurrent += self._bias

@@ -47,9 +47,8 @@ class Condition:
     One step is ``h = cell(x, h)``, then ``B = readout · h + readout_bias``. Two cells have no state: for ``"affine"``,
     ``B = readout · x + readout_bias``; for ``"min"``, B is the least of the sums ``weight_ih · x + bias_ih``, so that
     it holds where each of them is not below 0. A unit of the cell ``"switch"`` is 1 from the step on in which its sum
-    *on* is not below 0, and 0 from the step on in which *off* is not and *on* is; else it stays as it was. ``"min"``
-    and ``"switch"`` are not trained by gradient but found (:func:`~sb3_progpolicy.imitate`,
-    :func:`~sb3_progpolicy.simplify`) or written by hand.
+    *on* is not below 0, and 0 from the step on in which *off* is not and *on* is; else it stays as it was. It is not
+    trained by gradient but found (:func:`~sb3_progpolicy.simplify`) or written by hand.
 
     :param cell: ``"rnn"`` (tanh), ``"gru"``, ``"lstm"`` with PyTorch's equations, ``"switch"``, ``"affine"``, ``"min"``
     :param weight_ih: ``(n_gates * hidden_size, n_inputs)``, gates stacked in PyTorch's order; empty for ``"affine"``, a

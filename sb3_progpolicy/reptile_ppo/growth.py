@@ -62,6 +62,8 @@ def begin_growth(model: Any) -> Growth:
             f"search_method='growth' is not accepted with n_conditions={model.policy.n_conditions}, which fixes the "
             "program; depth gives the most conditions, plus 1"
         )
+    if model.policy.module.conditions.cell == "min":
+        raise ValueError("search_method='growth' is not accepted with conditions of several sums (cell='min')")
     if model.policy.module.depth < 2:
         raise ValueError("search_method='growth' is not accepted with depth=1, which has room for no condition")
     if model.search.searching:

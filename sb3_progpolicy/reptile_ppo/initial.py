@@ -43,9 +43,8 @@ def read_initial_program(given: ProgramData | str | os.PathLike[str] | None) -> 
             raise ValueError("init_program: a condition inside a then-branch is not accepted; those in else are")
     try:
         check_program(program)
-        for cell, why in (("switch", "a switch has no gradient"), ("min", "a min of several sums is not trained")):
-            if any(condition.cell == cell for condition in program.conditions):
-                raise ValueError(f"{why}, so that training cannot start from it")
+        if any(condition.cell == "switch" for condition in program.conditions):
+            raise ValueError("a switch has no gradient, so that training cannot start from it")
         shape_of(program)
     except ValueError as error:
         raise ValueError(f"init_program: {error}") from None
@@ -133,7 +132,11 @@ def initial_policy_kwargs(program: Program, policy: type[BasePolicy], given: Map
 
 def _temperature(program: Program) -> float:
     """Return the temperature at which conditions are as good as decided, by the size of their weights."""
-    sizes = [max(map(abs, condition.readout)) for condition in program.conditions]
+    sizes = [
+        max(map(abs, weights))
+        for condition in program.conditions
+        for weights in ((condition.readout,) if condition.remembers else condition.rows)
+    ]
     return TEMPERATURE * min((size for size in sizes if size), default=1.0)
 
 

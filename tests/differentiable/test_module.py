@@ -11,7 +11,7 @@ from sb3_progpolicy.differentiable.conditions import Conditions
 from sb3_progpolicy.differentiable.module import ProgramModule
 from sb3_progpolicy.programs import ActionSpec, Program, ProgramRunner
 
-CELLS = ("affine", "rnn", "gru", "lstm")
+CELLS = ("affine", "min", "rnn", "gru", "lstm")
 ACTIONS = {
     "discrete": ActionSpec("discrete", (4,)),
     "box": ActionSpec("box", (3,), (-9.0,) * 3, (9.0,) * 3),

@@ -89,6 +89,8 @@ def episode(program, env_id, n_envs=4, n_steps=150, **options):
         ("ProgPolicy", "Pendulum-v1", recurrent("gru", 3)),
         ("ProgPolicy", "Pendulum-v1", recurrent("lstm", 2)),
         ("ProgPolicy", "Pendulum-v1", recurrent("rnn", 1)),
+        ("PRLPolicy", "Pendulum-v1", recurrent("min", 2)),
+        ("ProgPolicy", "Pendulum-v1", recurrent("min", 3)),
     ],
 )
 def test_program_of_the_model_is_the_one_given_in_single_precision(policy, env, program):
