@@ -101,7 +101,7 @@ class ProgrammaticPolicy(ProgrammaticActorCritic):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         if kwargs.setdefault("cell", "affine") not in STATELESS:
             raise ValueError(
-                f"cell={kwargs['cell']!r} is not accepted; 'affine' and 'min' are, and recurrent cells (gru, lstm, rnn) "
+                f"cell={kwargs['cell']!r} is not accepted; 'affine' and 'min' are; recurrent cells (gru, lstm, rnn) "
                 "are those of RecurrentProgrammaticPolicy"
             )
         super().__init__(*args, **kwargs)
