@@ -36,6 +36,7 @@ CELLS = ("affine", "min", *RECURRENT_CELLS)
 MAX_SUMS = 3
 N_ROUNDS, N_PLAIN_ROUNDS, N_SPARSE_ROUNDS = 9, 10, 3
 _N_BRIEF_ROUNDS = 6  # in place of N_ROUNDS, where plain lists are what is asked for
+_PLAIN_TOLERANCE = 0.05
 _CHANGED = 0.02  # share of the actions, or mean distance, that rounding may change
 _DIGITS = (2, 3, 4, 6)
 #: Inputs that are not read by default: beyond the training sizes they take values that were never seen.
@@ -75,7 +76,7 @@ def imitate(
     interaction: bool = False,
     ignore: Sequence[str] = IGNORED,
     score_tolerance: float = 0.015,
-    plain_tolerance: float = 0.05,
+    plain_tolerance: float | None = None,
     n_episodes: int | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     augment: str | Augment | None = None,
@@ -109,8 +110,9 @@ def imitate(
     :param interaction: whether the program reads its previous action, reward and done flag, too
     :param ignore: names of inputs that the program must not read
     :param score_tolerance: share of the score that fewer and rounder numbers may cost
-    :param plain_tolerance: share of the score that a plain program may cost, which a person can read; 0 takes it only
-        if it is at least as good as the list that all inputs are open to
+    :param plain_tolerance: share of the score that a plain program may cost, which a person can read, by default 0.05;
+        0 takes it only if it is at least as good as the list that all inputs are open to. With ``cell="min"`` it is
+        always taken
     :param n_episodes: of each validation, on training variations; the last ones have twice as many. By default 24, or
         96 where there is no goal (no ``is_success`` in ``info``), since returns vary more than successes
     :param env_kwargs: constructor arguments of the environment
@@ -140,6 +142,9 @@ def imitate(
             f"n_timesteps={n_timesteps}, max_conditions={max_conditions}, n_episodes={n_episodes} are not accepted; "
             f"at least {n_shares * n_envs} (for n_envs={n_envs}), 0 and 1 are"
         )
+    if cell == "min" and plain_tolerance is not None:
+        raise ValueError(f"plain_tolerance={plain_tolerance} is not accepted with cell='min': a plain program is taken")
+    plain_tolerance = _PLAIN_TOLERANCE if plain_tolerance is None else plain_tolerance
     if not (score_tolerance >= 0 and plain_tolerance >= 0):
         raise ValueError(
             f"score_tolerance={score_tolerance} and plain_tolerance={plain_tolerance} are not accepted; shares of at "
@@ -200,7 +205,9 @@ class _Run:
         self.n_labelled = 0
         #: Teachers with continuous actions may be made of pieces.
         self.n_plain_rounds = N_PLAIN_ROUNDS if self.spec.kind == "box" else 0
-        self.n_dense_rounds = min(N_ROUNDS, _N_BRIEF_ROUNDS) if settings.max_sums > 1 else N_ROUNDS
+        #: Whether a plain list is asked for, whatever another one reaches.
+        self.wants_plain = settings.max_sums > 1
+        self.n_dense_rounds = min(N_ROUNDS, _N_BRIEF_ROUNDS) if self.wants_plain else N_ROUNDS
 
     @property
     def n_rounds(self) -> int:
@@ -243,7 +250,7 @@ class _Run:
         first = 0
         if checkpoint is not None and checkpoint.exists():
             first = self._restore(load_state(checkpoint, origin))
-        self.judge.final = first >= self.n_dense_rounds
+        self.judge.final = first >= self.n_dense_rounds and self.selection.best is not None
         total = self.n_rounds
         for number in range(first, total):
             self._round(number, n_steps)
@@ -329,25 +336,31 @@ class _Run:
             self._visit(number, n_steps)
         if number < self.n_dense_rounds - 1:
             for candidate in learner.fit(number):
-                if number >= self.n_dense_rounds // 2 - 1:
+                if number >= self.n_dense_rounds // 2 - 1 and not self.wants_plain:
                     selection.offer(candidate)
             return
-        if number == self.n_dense_rounds - 1:
-            for candidate in learner.finish():
-                selection.offer(candidate)
-            selection.choose_finally()
+        if number == self.n_dense_rounds - 1 and not self.wants_plain:
+            self._choose_dense()
         if number < n_before_sparse:
             is_last = number == n_before_sparse - 1
             selection.make_plain(number - self.n_dense_rounds + 2, 0 if is_last else n_steps * len(self.collector.pool))
-            if is_last:
+            if is_last or selection.is_sure:
                 selection.choose_plain()
-                if not selection.is_plain:
-                    selection.make_short()
-                    selection.make_sparse()
+            if is_last and not selection.is_plain:
+                if self.wants_plain:
+                    self._choose_dense()
+                selection.make_short()
+                selection.make_sparse()
         else:
             selection.offer(learner.refit_sparse(), sparse=True)
         if selection.is_plain or number == self.n_rounds - 1:
             selection.drop_rare_branches()
+
+    def _choose_dense(self) -> None:
+        """Fit the present list for longer, and let it and the best ones so far play their last episodes."""
+        for candidate in self.learner.finish():
+            self.selection.offer(candidate)
+        self.selection.choose_finally()
 
     def _visit(self, number: int, n_steps: int) -> None:
         """Label states that teacher and student visit in turns.

@@ -9,6 +9,7 @@ import numpy as np
 from sb3_progpolicy.imitation.decision_list import DecisionList
 
 Scored = tuple[float, DecisionList]
+_SURE = 5  # series without a lost episode
 _DOUBT = 0.05  # deviation of a score from the mean of many
 _PRICE = 3e-4  # of a number of a plain list, in its score
 
@@ -19,19 +20,26 @@ class Plain:
 
     :param candidate: on raw observations
     :param scores: of each series that it has played, the last one last
+    :param n_lost: episodes that it lost in them all
     """
 
     candidate: DecisionList
     scores: tuple[float, ...]
+    n_lost: int = 0
 
     @property
     def last(self) -> float:
         """The score in the last series."""
         return self.scores[-1]
 
-    def and_then(self, score: float) -> Plain:
+    @property
+    def is_sure(self) -> bool:
+        """Whether it has lost no episode of many."""
+        return len(self.scores) >= _SURE and not self.n_lost
+
+    def and_then(self, score: float, n_lost: int) -> Plain:
         """Return the list with one more score."""
-        return replace(self, scores=(*self.scores, score))
+        return replace(self, scores=(*self.scores, score), n_lost=self.n_lost + n_lost)
 
     def value(self) -> float:
         """Return the mean score, less a deviation of it, and the price of the numbers."""

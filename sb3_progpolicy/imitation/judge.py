@@ -39,6 +39,8 @@ class Judge:
         self.patience: Patience | None = Patience(len(pool), self.limit)
         #: Means of the episodes played last.
         self.last_result: dict[str, float] = {}
+        #: How many of them did not reach their goal; where there is none, all.
+        self.last_lost = 0
 
     @property
     def limit(self) -> int:
@@ -79,6 +81,7 @@ class Judge:
         if needed is not None and self.as_good(episodes.score(steps), needed, share=_HOPELESS):
             rest = self._play(act, variations, n_episodes - n_first, seed + n_first, watcher)
             episodes = episodes.and_then(rest)
+        self.last_lost = len(episodes.returns) - int(episodes.successes.sum())
         return episodes.score(steps), episodes.summary()
 
     def score_at_length(self, act: Act, variations: Variations = (), needed: float | None = None) -> float:

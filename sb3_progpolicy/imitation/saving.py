@@ -72,7 +72,7 @@ def save_state(path: Path, origin: Mapping[str, Any], state: State) -> None:
         "generators": state.generators,
         "has_best": state.best is not None,
         "scores": [score for score, _ in scored],
-        "plain_scores": [plain.scores for plain in state.plain],
+        "plain": [(plain.scores, plain.n_lost) for plain in state.plain],
         "result": dict(state.result),
         "reference": state.reference,
     }
@@ -109,7 +109,10 @@ def load_state(path: Path, origin: Mapping[str, Any]) -> State:
             targets=parts["targets"],
             weights=parts["weights"],
             present=_list(parts, "present") if "present_controllers" in parts else None,
-            plain=tuple(Plain(_list(parts, f"plain{i}"), tuple(own)) for i, own in enumerate(about["plain_scores"])),
+            plain=tuple(
+                Plain(_list(parts, f"plain{index}"), tuple(scores), n_lost)
+                for index, (scores, n_lost) in enumerate(about["plain"])
+            ),
             best=scored[0] if about["has_best"] else None,
             runners_up=tuple(scored[int(about["has_best"]) :]),
             result=about["result"],

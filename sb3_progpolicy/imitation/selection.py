@@ -106,7 +106,9 @@ class Selection:
         for plain in [*self.plain[:_AGAIN], *(Plain(candidate, ()) for candidate in candidates)]:
             best = max((one.last for one in (*kept, *found)), default=None)
             score = self.judge.score(self.codec.act_of(plain.candidate), best, series, witness)
-            (kept if plain.scores else found).append(plain.and_then(score))
+            (kept if plain.scores else found).append(plain.and_then(score, self.judge.last_lost))
+            if self.best is None and (best is None or score >= best):
+                self.result = self.judge.last_result
         # Of equal ones the later: it has seen more.
         self.plain = sorted([*reversed(found), *kept, *self.plain[_AGAIN:]], key=Plain.value, reverse=True)[:_FINALISTS]
         self.learner.raw = max([*found, *kept], key=Plain.value).candidate
@@ -116,27 +118,37 @@ class Selection:
             self.learner.add(visits.inputs, self.codec.encode(visits.actions), visits.weights)
 
     def choose_plain(self) -> None:
-        """Go on with the smallest of the best plain lists if its episodes are nearly as good as the best list's.
+        """Go on with the smallest of the best plain lists if its episodes are nearly as good as those of the best list.
 
         Episodes beyond training count as much as those of training.
         """
-        assert self.best is not None
         if not self.plain:
             return
+        self.judge.final = True
         candidates = [plain.candidate for plain in self.plain]
         parts: list[list[float]] = []
         for candidate in candidates:
             parts.append(self._merits(candidate, max(parts, key=np.mean, default=[])))
         merits = [float(np.mean(part)) for part in parts]
-        dense = float(np.mean(self._merits(self.best[1], max(parts, key=np.mean))))
         as_good = [index for index, merit in enumerate(merits) if self.judge.as_good(merit, max(merits), share=0.5)]
         index = min(as_good, key=lambda one: n_numbers(candidates[one]))
-        loss = self.learner.loss_of if self.augment is not None else lambda _: 0.0
         chosen = candidates[index]
-        if within(merits[index] - loss(chosen), dense - loss(self.best[1]), self.plain_tolerance):
+        if self.best is None or self._costs_little(chosen, merits[index], max(parts, key=np.mean)):
             self.best, self.is_plain = (self.score(chosen), chosen), True
             self.learner.raw, self.reference = self.best[1], self.best[0]
             self.result = self.judge.last_result
+
+    def _costs_little(self, chosen: DecisionList, merit: float, needed: Sequence[float]) -> bool:
+        """Return whether a plain list of a merit is nearly as good as the best list."""
+        assert self.best is not None
+        dense = float(np.mean(self._merits(self.best[1], needed)))
+        loss = self.learner.loss_of if self.augment is not None else lambda _: 0.0
+        return within(merit - loss(chosen), dense - loss(self.best[1]), self.plain_tolerance)
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether one of the best plain lists has lost no episode of many."""
+        return any(plain.is_sure for plain in self.plain)
 
     def make_sparse(self) -> None:
         """Go on with the program of fewest inputs whose episodes are as good as the best ones.

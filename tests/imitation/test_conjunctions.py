@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sb3_progpolicy.imitation import imitate
+from sb3_progpolicy.evaluation import evaluate_program
+from sb3_progpolicy.imitation import candidates, imitate
 from sb3_progpolicy.imitation.actions import ActionCodec
+from sb3_progpolicy.imitation.candidates import Plain
 from sb3_progpolicy.imitation.conjunctions import ConditionFitter, holds
 from sb3_progpolicy.imitation.conversion import rounded, to_program
 from sb3_progpolicy.imitation.decision_list import Data, DecisionList
@@ -94,11 +96,12 @@ def test_numbers_of_all_sums_are_tuned():
 
 
 def test_state_keeps_which_condition_each_sum_is_of(tmp_path):
-    empty = np.zeros((0, 3), dtype=np.float32)
-    state = State(1, 2, {}, empty, np.zeros((0, 1)), np.zeros(0), KNOWN, (), (0.5, KNOWN), (), {}, 0.0)
+    empty, plain = np.zeros((0, 3), dtype=np.float32), Plain(KNOWN, (0.5, 0.75), 3)
+    state = State(1, 2, {}, empty, np.zeros((0, 1)), np.zeros(0), KNOWN, (plain,), (0.5, KNOWN), (), {}, 0.0)
     save_state(tmp_path / "state.npz", {}, state)
     found = load_state(tmp_path / "state.npz", {})
-    for program in (found.present, found.best[1]):
+    assert (found.plain[0].scores, found.plain[0].n_lost) == ((0.5, 0.75), 3)
+    for program in (found.present, found.best[1], found.plain[0].candidate):
         np.testing.assert_array_equal(program.branches(some_inputs()), KNOWN.branches(some_inputs()))
 
 
@@ -126,8 +129,26 @@ def test_list_with_several_sums_takes_one_more_branch():
         DecisionList(SUMS, CONTROLLERS)
 
 
+def test_plain_list_is_taken_and_rounds_end_once_it_has_lost_no_episode_of_many(monkeypatch):
+    assert not Plain(KNOWN, (0.9,) * 5, 1).is_sure
+    assert not Plain(KNOWN, (0.9,) * 3).and_then(0.9, 0).is_sure
+    assert Plain(KNOWN, (0.9,) * 3).and_then(0.9, 0).and_then(0.9, 0).is_sure
+    monkeypatch.setattr(candidates, "_SURE", 2)
+    seen = []
+    arguments = {"n_timesteps": 1000, "n_episodes": 4, "max_conditions": 2, "n_envs": 4, "cell": "min"}
+    program = imitate("planner", "PandaReach-v0", **arguments, callback=seen.append)
+    rounds = [progress.round for progress in seen]
+    assert rounds == [*range(1, 7), seen[0].n_rounds]  # plain lists are made from the sixth round on
+    assert {condition.cell for condition in program.conditions} <= {"affine", "min"}
+    assert len(program.conditions) <= 2
+    (row,) = evaluate_program(program, "PandaReach-v0", [{"n_targets": 2}], 4)
+    assert row.success_rate == 1
+
+
 def test_discrete_actions_are_not_accepted():
     with pytest.raises(ValueError, match="cell='min' is not accepted for discrete actions; for Box actions it is"):
         imitate(lambda observations: np.zeros(len(observations)), "CartPole-v1", n_timesteps=2000, cell="min")
     with pytest.raises(ValueError, match="cell='min' is not accepted with max_conditions=0; with at least 1 it is"):
         imitate("planner", "PandaReach-v0", n_timesteps=2000, cell="min", max_conditions=0)
+    with pytest.raises(ValueError, match=r"plain_tolerance=0\.1 is not accepted with cell='min'"):
+        imitate("planner", "PandaReach-v0", n_timesteps=2000, cell="min", plain_tolerance=0.1)
