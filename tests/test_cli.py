@@ -228,7 +228,7 @@ def test_render_writes_a_film(tmp_path):
         (["train", "--hyperparams", "n_step:3"], "nearest: n_steps"),
         (["train", "--hyperparams", "n_steps:many"], "n_steps='many'"),
         (["train", "--hyperparams", "n_steps"], "name:value"),
-        (["train", "--hyperparams", "policy_kwargs:dict(cell='gr')"], "affine, rnn, gru, lstm"),
+        (["train", "--hyperparams", "policy_kwargs:dict(cell='gr')"], "affine, min, rnn, gru, lstm"),
         (["train", "--hyperparams", "batch_size:7"], "batch_size=7"),
         (["train", "--env-kwargs", "n_disc:3"], "nearest: n_discs"),
         (["train", "--sed", "3"], "--seed"),
