@@ -56,7 +56,7 @@ class ProgramSampler:
             input_weight, input_bias = _view(conditions.input_weight), _view(conditions.affine.bias)
         else:
             input_weight, input_bias = np.zeros((0, module.n_inputs), np.float32), np.zeros(0, np.float32)
-        self._n_gates = len(input_bias)
+        self._n_gates, self._n_sums = len(input_bias), conditions.n_sums
         controllers = (
             _view(parameter).reshape(module.n_controllers, self.action.n_outputs, -1)[self._in_use]
             for parameter in module.controller_parameters()
@@ -167,14 +167,14 @@ class ProgramSampler:
     def _run_conditions(self, gates: Array, out: Array) -> None:
         """Advance the states and write the values of B into ``out``.
 
-        :param gates: the affine part of the conditions, ``(n_envs, n_gates * hidden_size)``
+        :param gates: the affine part of the conditions, ``(n_envs, n_gates * hidden_size or n_conditions * n_sums)``
         :param out: ``(n_envs, n_conditions)``
         """
-        if not self.recurrent and gates.shape == out.shape:
-            out[:] = gates
-            return
         if not self.recurrent:
-            np.minimum.reduce(gates.reshape(len(gates), self.n_conditions, self.size), axis=-1, out=out)
+            if self._n_sums == 1:
+                out[:] = gates
+            else:
+                np.minimum.reduce(gates.reshape(len(gates), self.n_conditions, self._n_sums), axis=-1, out=out)
             return
         recurrent = self._hidden @ self._weight
         recurrent += self._bias
