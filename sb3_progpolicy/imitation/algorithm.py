@@ -343,10 +343,12 @@ class _Run:
             self._choose_dense()
         if number < n_before_sparse:
             is_last = number == n_before_sparse - 1
-            selection.make_plain(number - self.n_dense_rounds + 2, 0 if is_last else n_steps * len(self.collector.pool))
+            selection.make_plain(number - self.n_dense_rounds + 2)
             if is_last or selection.is_sure:
                 selection.choose_plain()
-            if is_last and not selection.is_plain:
+            if not selection.is_plain and not is_last:
+                selection.label_seen(n_steps * len(self.collector.pool))
+            elif not selection.is_plain:
                 if self.wants_plain:
                     self._choose_dense()
                 selection.make_short()

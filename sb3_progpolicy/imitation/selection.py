@@ -56,6 +56,8 @@ class Selection:
         self.plain: list[Plain] = []
         #: Whether a plain list was taken over.
         self.is_plain = False
+        self._refused: list[DecisionList] = []  # plain lists of which none was taken
+        self._witness: Witness | None = None  # of what the plain lists saw in the present round
 
     def offer(self, candidate: DecisionList, sparse: bool = False) -> None:
         """Keep a candidate if its episodes are better than the best so far.
@@ -87,20 +89,18 @@ class Selection:
             if self._take_over(self.learner.short(n_branches)) is not None:
                 return
 
-    def make_plain(self, series: int, n_states: int) -> None:
-        """Keep the plain lists of the best episodes, and label states of all lists' episodes.
+    def make_plain(self, series: int) -> None:
+        """Keep the plain lists of the best episodes.
 
         :param series: number of these episodes, which are others each time: what is best of many on the same ones would
             soon be best there alone
-        :param n_states: to label
         """
         if series > _TRIES and not self.plain:
             return
         candidates = self.learner.plain([plain.candidate for plain in self.plain[:_AGAIN]], anew=series % 2 == 0)
         if not candidates:
             return
-        env = self.judge.pool.envs[0]
-        witness = Witness(env.action_space)
+        self._witness = witness = Witness(self.judge.pool.envs[0].action_space)
         kept: list[Plain] = []
         found: list[Plain] = []
         for plain in [*self.plain[:_AGAIN], *(Plain(candidate, ()) for candidate in candidates)]:
@@ -112,10 +112,18 @@ class Selection:
         # Of equal ones the later: it has seen more.
         self.plain = sorted([*reversed(found), *kept, *self.plain[_AGAIN:]], key=Plain.value, reverse=True)[:_FINALISTS]
         self.learner.raw = max([*found, *kept], key=Plain.value).candidate
-        if n_states:
-            visits = witness.visits(n_states, self.learner.rng)
-            visits = visits.with_changed(self.augment, self.judge.teacher, env, self.learner.rng)
-            self.learner.add(visits.inputs, self.codec.encode(visits.actions), visits.weights)
+
+    def label_seen(self, n_states: int) -> None:
+        """Label states of the episodes that the plain lists have just played, if there are any.
+
+        :param n_states: to label
+        """
+        if self._witness is None:
+            return
+        visits = self._witness.visits(n_states, self.learner.rng)
+        visits = visits.with_changed(self.augment, self.judge.teacher, self.judge.pool.envs[0], self.learner.rng)
+        self.learner.add(visits.inputs, self.codec.encode(visits.actions), visits.weights)
+        self._witness = None
 
     def choose_plain(self) -> None:
         """Go on with the smallest of the best plain lists if its episodes are nearly as good as those of the best list.
@@ -137,6 +145,8 @@ class Selection:
             self.best, self.is_plain = (self.score(chosen), chosen), True
             self.learner.raw, self.reference = self.best[1], self.best[0]
             self.result = self.judge.last_result
+        else:
+            self._refused += candidates
 
     def _costs_little(self, chosen: DecisionList, merit: float, needed: Sequence[float]) -> bool:
         """Return whether a plain list of a merit is nearly as good as the best list."""
@@ -147,8 +157,8 @@ class Selection:
 
     @property
     def is_sure(self) -> bool:
-        """Whether one of the best plain lists has lost no episode of many."""
-        return any(plain.is_sure for plain in self.plain)
+        """Whether one of the best plain lists has lost no episode of many, and was not compared in vain before."""
+        return any(one.is_sure and not any(one.candidate is other for other in self._refused) for one in self.plain)
 
     def make_sparse(self) -> None:
         """Go on with the program of fewest inputs whose episodes are as good as the best ones.

@@ -1,5 +1,6 @@
 """Plain lists: the pieces of a list that is known, found again and put in order."""
 
+import dataclasses
 import shutil
 
 import numpy as np
@@ -10,6 +11,7 @@ from sb3_progpolicy.imitation import algorithm, imitate
 from sb3_progpolicy.imitation import judge as judge_module
 from sb3_progpolicy.imitation.actions import ActionCodec
 from sb3_progpolicy.imitation.algorithm import N_ROUNDS, _Run
+from sb3_progpolicy.imitation.candidates import Plain as PlainList
 from sb3_progpolicy.imitation.conditions import fit_priced_condition, refit_condition
 from sb3_progpolicy.imitation.decision_list import Data, DecisionList, rest_losses
 from sb3_progpolicy.imitation.judge import Judge
@@ -229,7 +231,7 @@ def test_plain_list_is_taken_only_if_it_is_as_good_on_validation_variations(monk
         return beyond if len(asked) <= 4 and variations else 1.0
 
     monkeypatch.setattr(judge, "score_at_length", at_length)
-    selection.make_plain(1, 0)
+    selection.make_plain(1)
     assert selection.learner.raw is plain
     assert [one.candidate for one in selection.plain] == [plain, worse]
     selection.choose_plain()
@@ -237,6 +239,12 @@ def test_plain_list_is_taken_only_if_it_is_as_good_on_validation_variations(monk
     assert selection.is_plain == (beyond > 0.9)  # the mean of training and validation may cost a twentieth
     assert selection.best[1] is (plain if beyond > 0.9 else best)
     assert selection.learner.raw is plain  # the states that it visits are those to learn from
+    selection.plain = [dataclasses.replace(one, scores=(1.0,) * 5) for one in selection.plain]
+    assert selection.is_sure == selection.is_plain  # lists that were refused are not compared again
+    selection.plain.append(PlainList(plain, (1.0,) * 5))
+    assert selection.is_sure == selection.is_plain
+    selection.plain.append(PlainList(DecisionList(np.zeros((0, 33)), np.zeros((1, 4, 33))), (1.0,) * 5))
+    assert selection.is_sure  # another one is
 
 
 def test_next_plain_list_is_made_of_the_one_of_the_best_episodes_and_is_seen_to_be_far_worse_in_a_few(monkeypatch):
@@ -269,8 +277,9 @@ def test_next_plain_list_is_made_of_the_one_of_the_best_episodes_and_is_seen_to_
     monkeypatch.setattr(judge_module, "play", counted)
     selection = Selection(Plain(), judge, (), codec, None, 0.05)
     with Pool("PandaReach-v0", 4) as judge.pool:
-        selection.make_plain(1, 0)
-        selection.make_plain(2, 50)
+        selection.make_plain(1)
+        selection.make_plain(2)
+        selection.label_seen(50)
         ((inputs, targets, weights),) = added
         labels = codec.encode(judge.teacher.label_alone(inputs, judge.pool.envs[0]))
     assert given == [([], False), ([good, idle], True)]
@@ -296,7 +305,8 @@ def test_pieces_that_explain_nothing_are_looked_for_in_three_rounds_only():
         judge = Judge(pool, [{"n_targets": 1}], 2, 0.015, make_teacher("planner", pool.envs[0]))
     selection = Selection(NoPieces(), judge, (), None, None, 0.05)
     for series in range(1, 11):
-        selection.make_plain(series, 50)
+        selection.make_plain(series)
+        selection.label_seen(50)
     assert selection.learner.asked == 3
 
 
