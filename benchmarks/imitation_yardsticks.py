@@ -24,10 +24,10 @@ from study import write_results
 from progpolicy_envs import find_domain
 from sb3_progpolicy.imitation import make_teacher
 from sb3_progpolicy.imitation.actions import ActionCodec
-from sb3_progpolicy.imitation.algorithm import N_ROUNDS, N_SPARSE_ROUNDS, TEACHER_SHARES
 from sb3_progpolicy.imitation.augmentation import make_augmentation, make_starts
 from sb3_progpolicy.imitation.decision_list import Scaler
 from sb3_progpolicy.imitation.rollouts import Act, Pool, play
+from sb3_progpolicy.imitation.rounds import N_ROUNDS, N_SPARSE_ROUNDS, TEACHER_SHARES
 from sb3_progpolicy.imitation.tasks import names_of, training_variations
 from sb3_progpolicy.imitation.visits import Collector
 from sb3_progpolicy.spaces import action_spec

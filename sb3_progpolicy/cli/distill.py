@@ -49,8 +49,8 @@ def distill(
 ) -> None:
     """Learn a program from what a planner or a trained model does, and compare the two.
 
-    With -o, an interrupted run leaves its best program in the file, and goes on when it is started again (with --cell
-    gru it begins anew).
+    With -o c.json, an interrupted run leaves its best program in c.part.json, and goes on when it is started again
+    (with --cell gru it begins anew). What is in c.json is replaced when all is done.
     """
     if output is not None:
         check_folder(output)
@@ -99,7 +99,7 @@ def _find_teacher(name: str, env: str | None, allow_pickle: bool) -> tuple[Any, 
 
 
 def _imitated(teacher: Any, env_id: str, output: Path | None, arguments: dict[str, Any]) -> Program:
-    """Imitate with a progress bar; the best program so far is in the file after each round."""
+    """Imitate with a progress bar; the best program so far is in a file of its own after each round."""
     from rich.console import Console
     from rich.progress import Progress
 
@@ -107,6 +107,7 @@ def _imitated(teacher: Any, env_id: str, output: Path | None, arguments: dict[st
 
     keeps_state = output is not None and arguments["cell"] != "gru"
     state = output.with_suffix(".state.npz") if output is not None and keeps_state else None
+    part = output.with_suffix(".part.json") if output is not None else None
     with Progress(console=Console(stderr=True)) as progress:
         bar = progress.add_task(f"Imitating on {env_id}", total=None)
 
@@ -115,14 +116,15 @@ def _imitated(teacher: Any, env_id: str, output: Path | None, arguments: dict[st
             reached = f"{so_far.result[name]:.3g}" if name in so_far.result else "-"
             words = f"{so_far.n_states} states, {name} {reached} (teacher {so_far.teacher[name]:.3g})"
             progress.update(bar, completed=so_far.round, total=so_far.n_rounds, description=words)
-            if output is not None:
-                so_far.program.save(output)
+            if part is not None:
+                so_far.program.save(part)
 
         program = imitate(teacher, env_id, callback=show, checkpoint=state, **arguments)
     if output is not None:
         program.save(output)
-    if state is not None:
-        state.unlink(missing_ok=True)
+    for file in (state, part):
+        if file is not None:
+            file.unlink(missing_ok=True)
     return program
 
 

@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_progpolicy.experiment.config import RunConfig, parse_config
 from sb3_progpolicy.experiment.methods import Method, get_method
+from sb3_progpolicy.experiment.stock_files import stock_algorithm
 from sb3_progpolicy.extraction import extract_program, holds_program
 from sb3_progpolicy.hyperparams import read_yaml, shortened
 from sb3_progpolicy.programs.files import write_atomically
@@ -145,7 +146,9 @@ def read_config(folder: str | Path) -> RunConfig:
 
 
 def load_model(path: str | Path, env: VecEnv | None = None, allow_pickle: bool = False, **kwargs: Any) -> BaseAlgorithm:
-    """Load a model saved by any of our algorithms: the one that the configuration next to it names, or ReptilePPO.
+    """Load a model: of the algorithm that the configuration next to it names, else of the one that the file is of.
+
+    Without a configuration these are ReptilePPO and the algorithms of Stable-Baselines3 and sb3-contrib.
 
     :param path: a ``.zip`` file
     :param env: environments to go on training in
@@ -158,15 +161,17 @@ def load_model(path: str | Path, env: VecEnv | None = None, allow_pickle: bool =
     if not path.is_file():
         raise ValueError(f"{path} does not exist; a model is a .zip file")
     config = read_config(path.parent) if (path.parent / CONFIG).is_file() else None
+    stock = stock_algorithm(path) if config is None else None
     method = get_method("reptile_ppo" if config is None else config.algo)
-    if "allow_pickle" in inspect.signature(method.algorithm.load).parameters:
+    algorithm = stock or method.algorithm
+    if "allow_pickle" in inspect.signature(algorithm.load).parameters:
         kwargs["allow_pickle"] = allow_pickle
-    elif not method.has_reptile and not allow_pickle:
+    elif (stock is not None or not method.has_reptile) and not allow_pickle:
         raise ValueError(
-            f"{path} is a model of {method.algorithm.__name__}, which is saved with pickle: loading it runs the code "
+            f"{path} is a model of {algorithm.__name__}, which is saved with pickle: loading it runs the code "
             "in it. If you trust the file, give --allow-pickle"
         )
-    return _algorithm_of(method, config, env).load(path, env=env, **kwargs)
+    return (stock or _algorithm_of(method, config, env)).load(path, env=env, **kwargs)
 
 
 def _algorithm_of(method: Method, config: RunConfig | None, env: VecEnv | None) -> type[BaseAlgorithm]:

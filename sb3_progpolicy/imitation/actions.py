@@ -18,7 +18,7 @@ class ActionCodec:
 
     :param spec: the action space
     :param names: one for each output
-    :raises ValueError: if the space is neither a Box nor Discrete
+    :raises ValueError: if the space is neither a Box with bounds nor Discrete
     """
 
     def __init__(self, spec: ActionSpec, names: tuple[str, ...]) -> None:
@@ -29,9 +29,12 @@ class ActionCodec:
             )
         self.spec, self.names = spec, names
         low, high = np.array(spec.low), np.array(spec.high)
-        self.bounded = np.isfinite(low) & np.isfinite(high)
-        self.middle = np.where(self.bounded, (low + high) / 2, 0.0)
-        self.half = np.where(self.bounded, (high - low) / 2, 1.0)
+        if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
+            raise ValueError(
+                f"Box actions from {low.tolist()} to {high.tolist()} are not accepted; each number has finite bounds, "
+                "the lower one below the upper one"
+            )
+        self.middle, self.half = (low + high) / 2, (high - low) / 2
         #: Size of a large output, ``(n_outputs,)``.
         self.unit = self.half if spec.kind == "box" else np.ones(spec.n_outputs)
 
@@ -40,21 +43,20 @@ class ActionCodec:
         if self.spec.kind == "discrete":
             return DiscreteLoss()
         moves = tuple(index for index, name in enumerate(self.names) if name.startswith("move_"))
-        return BoxLoss(self.bounded, moves if len(moves) > 1 else ())
+        return BoxLoss(np.ones(self.spec.n_outputs, dtype=bool), moves if len(moves) > 1 else ())
 
     def encode(self, actions: NDArray[Any]) -> Floats:
         """Return labels ``(n, n_outputs)``."""
         if self.spec.kind == "discrete":
             return np.eye(self.spec.sizes[0])[np.asarray(actions, dtype=np.int64).ravel() - self.spec.start]
         scaled = (np.asarray(actions, dtype=np.float64).reshape(len(actions), -1) - self.middle) / self.half
-        return np.where(self.bounded, np.clip(scaled, -1, 1), scaled)
+        return np.clip(scaled, -1, 1)
 
     def decode(self, outputs: Floats) -> NDArray[Any]:
         """Return actions for the outputs of controllers that were fitted to labels, ``(n, n_outputs)``."""
         if self.spec.kind == "discrete":
             return outputs.argmax(axis=1) + self.spec.start
-        clipped = np.where(self.bounded, np.clip(outputs, -1, 1), outputs)
-        return (clipped * self.half + self.middle).astype(np.float32)
+        return (np.clip(outputs, -1, 1) * self.half + self.middle).astype(np.float32)
 
     def act_of(self, raw: DecisionList) -> Callable[[NDArray[np.floating]], NDArray[Any]]:
         """Return a list on raw observations as a function from observations to actions."""

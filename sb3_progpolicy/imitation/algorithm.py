@@ -1,66 +1,25 @@
-"""DAgger with decision lists: the student acts more and more, the teacher labels what it meets."""
+"""From a teacher to a program, by DAgger: the student acts more and more, the teacher labels what it meets."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 from threadpoolctl import threadpool_limits
 
-from sb3_progpolicy.imitation.actions import ActionCodec
-from sb3_progpolicy.imitation.augmentation import Augment, make_augmentation, make_starts
-from sb3_progpolicy.imitation.conversion import make_program, rounded, to_program
-from sb3_progpolicy.imitation.decision_list import DecisionList
-from sb3_progpolicy.imitation.judge import Judge
-from sb3_progpolicy.imitation.learner import Learner, Settings
-from sb3_progpolicy.imitation.memory import SHARES, MemoryRun, imitate_with_memory
+from sb3_progpolicy.imitation.arguments import check_arguments, check_tasks
+from sb3_progpolicy.imitation.augmentation import Augment, make_starts
+from sb3_progpolicy.imitation.learner import Settings
+from sb3_progpolicy.imitation.memory import SHARES
 from sb3_progpolicy.imitation.recurrent import RECURRENT_CELLS
-from sb3_progpolicy.imitation.rollouts import Pool, ProgramAct, Variations
-from sb3_progpolicy.imitation.saving import State, load_state, save_state
-from sb3_progpolicy.imitation.selection import Selection
-from sb3_progpolicy.imitation.tasks import names_of, training_variations, validation_variations
-from sb3_progpolicy.imitation.teachers import Teacher, TeacherLike, make_teacher
-from sb3_progpolicy.imitation.visits import Collector
+from sb3_progpolicy.imitation.rollouts import Pool, Variations
+from sb3_progpolicy.imitation.rounds import IGNORED, Imitation, Run, n_shares
+from sb3_progpolicy.imitation.teachers import TeacherLike
 from sb3_progpolicy.programs.program import Program
-from sb3_progpolicy.programs.syntax import Expression
-from sb3_progpolicy.spaces import action_spec
 
-#: Share of the teacher in each round; 0 in all later ones.
-TEACHER_SHARES = (1.0, 0.6, 0.4, 0.3, 0.2, 0.1)
-#: Of the conditions that :func:`imitate` makes.
-CELLS = ("affine", "min", *RECURRENT_CELLS)
 #: Sums of a condition at most, if ``cell="min"``.
 MAX_SUMS = 3
-N_ROUNDS, N_PLAIN_ROUNDS, N_SPARSE_ROUNDS = 9, 10, 3
-_N_BRIEF_ROUNDS = 6  # in place of N_ROUNDS, where plain lists are what is asked for
-_PLAIN_TOLERANCE = 0.05
-_CHANGED = 0.02  # share of the actions, or mean distance, that rounding may change
-_DIGITS = (2, 3, 4, 6)
-#: Inputs that are not read by default: beyond the training sizes they take values that were never seen.
-IGNORED = ("left",)
-
-
-@dataclass(frozen=True)
-class Imitation:
-    """How far an imitation has come.
-
-    :param round: rounds that are done
-    :param n_rounds: rounds in all
-    :param n_states: labelled states so far
-    :param result: of the best program in its validation: success, if there is a goal, steps and return
-    :param teacher: the teacher's
-    :param program: the best so far
-    """
-
-    round: int
-    n_rounds: int
-    n_states: int
-    result: Mapping[str, float]
-    teacher: Mapping[str, float]
-    program: Program
 
 
 def imitate(
@@ -81,7 +40,7 @@ def imitate(
     env_kwargs: Mapping[str, Any] | None = None,
     augment: str | Augment | None = None,
     callback: Callable[[Imitation], None] | None = None,
-    checkpoint: Path | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
 ) -> Program:
     """Return a program that does what a teacher does, learned from the teacher's actions, not from rewards.
 
@@ -96,11 +55,12 @@ def imitate(
     teacher does, is taken if the mean of its scores on these and on the domain's validation variations is as good;
     unseen variations are not looked at.
 
-    :param teacher: ``"planner"``, a model of Stable-Baselines3 or sb3-contrib, or a function from observations
-        ``(n_envs, n_observations)`` to actions
+    :param teacher: ``"planner"``, a model of Stable-Baselines3 or sb3-contrib, a program, or a function from
+        observations ``(n_envs, n_observations)`` to actions ``(n_envs, *action_shape)``. A model that was loaded
+        without its ``VecNormalize`` sees observations that are not normalised: give it to ``load`` as ``env``
     :param env_id: environment id
     :param tasks: variations to learn on, the easiest first; by default those that the domain is trained on
-    :param n_timesteps: states to label, at most
+    :param n_timesteps: states to label, at most; those that ``augment`` makes come on top
     :param max_conditions: of the program at most
     :param cell: of the conditions: ``"affine"``; ``"min"``, which lets conditions of a plain program ask for up to
         three things at once, Box actions only; or ``"gru"``, a memory of one unit each, where the teacher's action is
@@ -112,7 +72,7 @@ def imitate(
     :param score_tolerance: share of the score that fewer and rounder numbers may cost
     :param plain_tolerance: share of the score that a plain program may cost, which a person can read, by default 0.05;
         0 takes it only if it is at least as good as the list that all inputs are open to. With ``cell="min"`` it is
-        always taken
+        always taken; there is none for Discrete actions and with ``cell="gru"``
     :param n_episodes: of each validation, on training variations; the last ones have twice as many. By default 24, or
         96 where there is no goal (no ``is_success`` in ``info``), since returns vary more than successes
     :param env_kwargs: constructor arguments of the environment
@@ -120,297 +80,38 @@ def imitate(
         a generator to observations, or ``"taller_towers"`` for PandaStack; ``"begun_towers"`` begins half of its
         episodes with a tower of one to five blocks instead. What was learned so was shown more than the training
         variations; the metadata say so
-    :param callback: is called after each round
-    :param checkpoint: file in which the state is kept after each round; one that exists is gone on from
+    :param callback: is called after each round; what it returns is not looked at
+    :param checkpoint: file in which the state is kept after each round; one that exists is gone on from. It stays when
+        all is done
     :return: the program; its metadata say that it was learned by imitation, and of whom
     :raises ValueError: if an argument is not accepted
     """
-    if cell not in CELLS:
-        raise ValueError(f"cell={cell!r} is not accepted; cells of imitated programs are {', '.join(CELLS)}")
+    check_tasks(env_id, tasks)
     remembers = cell in RECURRENT_CELLS
-    if cell == "min" and max_conditions < 1:
-        raise ValueError(f"cell='min' is not accepted with max_conditions={max_conditions}; with at least 1 it is")
-    if remembers and (augment is not None or checkpoint is not None or max_conditions < 1):
-        raise ValueError(
-            f"cell={cell!r} is not accepted with augment={augment!r}, checkpoint={str(checkpoint)!r}, "
-            f"max_conditions={max_conditions}; only without augment and checkpoint, and with at least 1 condition: a "
-            "state that was not visited has no past, and the state of such an imitation is not kept"
-        )
-    n_shares = N_ROUNDS + 1 + N_PLAIN_ROUNDS + N_SPARSE_ROUNDS  # the first round has two
-    if n_timesteps < n_shares * n_envs or max_conditions < 0 or (n_episodes is not None and n_episodes < 1):
-        raise ValueError(
-            f"n_timesteps={n_timesteps}, max_conditions={max_conditions}, n_episodes={n_episodes} are not accepted; "
-            f"at least {n_shares * n_envs} (for n_envs={n_envs}), 0 and 1 are"
-        )
-    if cell == "min" and plain_tolerance is not None:
-        raise ValueError(f"plain_tolerance={plain_tolerance} is not accepted with cell='min': a plain program is taken")
-    plain_tolerance = _PLAIN_TOLERANCE if plain_tolerance is None else plain_tolerance
-    if not (score_tolerance >= 0 and plain_tolerance >= 0):
-        raise ValueError(
-            f"score_tolerance={score_tolerance} and plain_tolerance={plain_tolerance} are not accepted; shares of at "
-            "least 0 are"
-        )
+    checkpoint = check_arguments(
+        n_timesteps=n_timesteps,
+        least_timesteps=n_shares(),
+        max_conditions=max_conditions,
+        cell=cell,
+        seed=seed,
+        n_envs=n_envs,
+        interaction=interaction,
+        ignore=ignore,
+        score_tolerance=score_tolerance,
+        plain_tolerance=plain_tolerance,
+        n_episodes=n_episodes,
+        augment=augment,
+        checkpoint=checkpoint,
+    )
     begin = make_starts(augment)
     # The matrices are small: several threads of BLAS are slower than one, most of all where another process runs.
     one_thread = threadpool_limits(1, user_api="blas")
     with one_thread, Pool(env_id, n_envs, env_kwargs, interaction, begin) as pool:
         tolerances = score_tolerance, plain_tolerance
         settings = Settings(max_conditions + 1, seed, max_sums=MAX_SUMS if cell == "min" else 1)
-        run = _Run(pool, teacher, env_id, tasks, settings, ignore, n_episodes, tolerances, augment)
+        run = Run(pool, teacher, env_id, tasks, settings, ignore, n_episodes, tolerances, augment)
         n_states = n_timesteps // (len(SHARES) + 1 if remembers else run.n_rounds + 1)
         with Pool(env_id, run.n_rows(n_states), env_kwargs, interaction, begin) as visited:
             if remembers:
                 return run.run_with_memory(visited, n_states, callback)
             return run.run(visited, n_states, callback, checkpoint)
-
-
-class _Run:
-    """One imitation; see :func:`imitate`."""
-
-    def __init__(
-        self,
-        pool: Pool,
-        teacher: TeacherLike,
-        env_id: str,
-        tasks: Variations | None,
-        settings: Settings,
-        ignore: Sequence[str],
-        n_episodes: int | None,
-        tolerances: tuple[float, float],
-        augment: str | Augment | None,
-    ) -> None:
-        env: Any = pool.envs[0]
-        self.pool, self.seed = pool, settings.seed
-        self.spec = action_spec(env.action_space)
-        if settings.max_sums > 1 and self.spec.kind != "box":
-            raise ValueError(f"cell='min' is not accepted for {self.spec.kind} actions; for Box actions it is")
-        self.inputs, self.outputs = names_of(env, self.spec.n_outputs, pool.interaction)
-        self.codec = ActionCodec(self.spec, self.outputs)
-        self.teacher: Teacher = make_teacher(teacher, env)
-        self.variations, ranks = training_variations(env_id, tasks)
-        largest = max(ranks)
-        # The smaller sizes are the ends of the larger ones, which therefore say more.
-        ranked = list(zip(self.variations, ranks, strict=True))
-        validation = [one for least in (largest - 1, largest) for one, rank in ranked if rank >= least]
-        score_tolerance, plain_tolerance = tolerances
-        self.judge = Judge(pool, validation, n_episodes, score_tolerance, self.teacher)
-        self.ranks, self.augmentation = ranks, make_augmentation(augment, self.inputs)
-        self.origin: dict[str, Any] = {"env": env_id, "seed": self.seed, "teacher": self.teacher.name}
-        if augment is not None:
-            self.origin["augment"] = augment if isinstance(augment, str) else getattr(augment, "__name__", "function")
-        readable = np.array([name not in ignore for name in self.inputs])
-        self.learner = Learner(self.codec, readable, settings)
-        beyond = validation_variations(env_id) if tasks is None else ()
-        self.selection = Selection(self.learner, self.judge, beyond, self.codec, self.augmentation, plain_tolerance)
-        self.n_labelled = 0
-        #: Teachers with continuous actions may be made of pieces.
-        self.n_plain_rounds = N_PLAIN_ROUNDS if self.spec.kind == "box" else 0
-        #: Whether a plain list is asked for, whatever another one reaches.
-        self.wants_plain = settings.max_sums > 1
-        self.n_dense_rounds = min(N_ROUNDS, _N_BRIEF_ROUNDS) if self.wants_plain else N_ROUNDS
-
-    @property
-    def n_rounds(self) -> int:
-        """Number of rounds at most."""
-        return self.n_dense_rounds + self.n_plain_rounds + N_SPARSE_ROUNDS
-
-    def n_rows(self, n_states: int) -> int:
-        """Return in how many environments so many states are visited, so that each sees whole episodes."""
-        return min(len(self.pool), max(1, n_states // self.judge.limit))
-
-    def run(
-        self,
-        visited: Pool,
-        n_states: int,
-        callback: Callable[[Imitation], None] | None,
-        checkpoint: Path | None,
-    ) -> Program:
-        """Run all rounds, or those that a checkpoint leaves.
-
-        :param visited: environments in which states are visited
-        :param n_states: in each round; twice as many in the first
-        :param callback: see :func:`imitate`
-        :param checkpoint: see :func:`imitate`
-        """
-        self.collector = Collector(
-            visited, self.teacher, self.variations, self.ranks, self.seed, self.augmentation, self.judge.limit
-        )
-        n_steps = n_states // len(visited)
-        origin = {
-            **self.origin,
-            "n_steps": n_steps,
-            "max_branches": self.learner.settings.max_branches,
-            **({"cell": "min"} if self.learner.settings.max_sums > 1 else {}),
-            "n_episodes": self.judge.n_episodes,
-            "score_tolerance": self.judge.tolerance,
-            "plain_tolerance": self.selection.plain_tolerance,
-            "inputs": [name for name, read in zip(self.inputs, self.learner.readable, strict=True) if read],
-            "tasks": [dict(variation) for variation in self.variations],
-        }
-        first = 0
-        if checkpoint is not None and checkpoint.exists():
-            first = self._restore(load_state(checkpoint, origin))
-        self.judge.final = first >= self.n_dense_rounds and self.selection.best is not None
-        total = self.n_rounds
-        for number in range(first, total):
-            self._round(number, n_steps)
-            done = total if self.selection.is_plain else number + 1
-            if checkpoint is not None:
-                save_state(checkpoint, origin, self._state(done))
-            if callback is not None:
-                callback(self._progress(done, total))
-            if done == total:
-                break
-        return self._program(self._rounded())
-
-    def run_with_memory(self, visited: Pool, n_states: int, callback: Callable[[Imitation], None] | None) -> Program:
-        """Run all rounds with conditions that remember. See :meth:`run`."""
-
-        def program_of(body: Expression) -> Program:
-            return make_program(body, self.spec, self.inputs, self.outputs, self.pool.interaction, **self._metadata)
-
-        def after_round(done: int, total: int, n_labelled: int, best: Program) -> None:
-            self.n_labelled = n_labelled
-            if callback is not None:
-                summaries = self.judge.last_result, self.judge.teacher_episodes.summary()
-                callback(Imitation(done, total, n_labelled, *summaries, best))
-
-        self.judge.patience = None  # with a memory, the same observation again and again may be on the way
-
-        def score(program: Program) -> float:
-            return self.judge.score(ProgramAct(program, len(self.pool)))
-
-        run = MemoryRun(
-            collector=Collector(visited, self.teacher, self.variations, self.ranks, self.seed, None, self.judge.limit),
-            codec=self.codec,
-            readable=self.learner.readable,
-            seed=self.seed,
-            max_conditions=self.learner.settings.max_branches - 1,
-            horizon=int(self.judge.teacher_episodes.steps.mean()),
-            to_program=program_of,
-            score=score,
-            as_good=self.judge.as_good,
-            after_round=after_round,
-        )
-        return imitate_with_memory(run, n_states // len(visited))
-
-    def _state(self, number: int) -> State:
-        learner, collector, selection = self.learner, self.collector, self.selection
-        return State(
-            number=number,
-            next_seed=collector.next_seed,
-            generators={"learner": learner.rng.bit_generator.state, "collector": collector.rng.bit_generator.state},
-            observations=learner.observations,
-            targets=learner.targets,
-            weights=learner.weights,
-            present=learner.raw,
-            plain=tuple(selection.plain),
-            best=selection.best,
-            runners_up=tuple(selection.runners_up),
-            result=selection.result,
-            reference=selection.reference,
-        )
-
-    def _restore(self, state: State) -> int:
-        """Go back to a state; return the number of rounds that are done."""
-        learner, collector, selection = self.learner, self.collector, self.selection
-        learner.rng.bit_generator.state = state.generators["learner"]
-        collector.rng.bit_generator.state = state.generators["collector"]
-        collector.next_seed = state.next_seed
-        learner.observations, learner.targets, learner.weights = state.observations, state.targets, state.weights
-        learner.raw = state.present
-        selection.best, selection.runners_up = state.best, list(state.runners_up)
-        selection.result, selection.reference = state.result, state.reference
-        selection.plain = list(state.plain)
-        return state.number
-
-    def _round(self, number: int, n_steps: int) -> None:
-        learner, selection = self.learner, self.selection
-        n_before_sparse = self.n_dense_rounds + self.n_plain_rounds
-        if learner.n_states:
-            self.collector.stalls.deviations = deviations = learner.observations.std(axis=0)
-            if self.judge.patience is not None:
-                self.judge.patience.stalls.deviations = deviations[: self.pool.observations.shape[1]]
-        # Plain lists learn from the episodes that they were judged by.
-        if number >= n_before_sparse or not selection.plain:
-            self._visit(number, n_steps)
-        if number < self.n_dense_rounds - 1:
-            for candidate in learner.fit(number):
-                if number >= self.n_dense_rounds // 2 - 1 and not self.wants_plain:
-                    selection.offer(candidate)
-            return
-        if number == self.n_dense_rounds - 1 and not self.wants_plain:
-            self._choose_dense()
-        if number < n_before_sparse:
-            is_last = number == n_before_sparse - 1
-            selection.make_plain(number - self.n_dense_rounds + 2)
-            if is_last or selection.is_sure:
-                selection.choose_plain()
-            if not selection.is_plain and not is_last:
-                selection.label_seen(n_steps * len(self.collector.pool))
-            elif not selection.is_plain:
-                if self.wants_plain:
-                    self._choose_dense()
-                selection.make_short()
-                selection.make_sparse()
-        else:
-            selection.offer(learner.refit_sparse(), sparse=True)
-        if selection.is_plain or number == self.n_rounds - 1:
-            selection.drop_rare_branches()
-
-    def _choose_dense(self) -> None:
-        """Fit the present list for longer, and let it and the best ones so far play their last episodes."""
-        for candidate in self.learner.finish():
-            self.selection.offer(candidate)
-        self.selection.choose_finally()
-
-    def _visit(self, number: int, n_steps: int) -> None:
-        """Label states that teacher and student visit in turns.
-
-        :param number: of the round
-        :param n_steps: of each environment
-        """
-        self.collector.begin()
-        share = TEACHER_SHARES[number] if number < len(TEACHER_SHARES) else 0.0
-        student = None if self.learner.raw is None else self.codec.act_of(self.learner.raw)
-        visits = self.collector.collect(n_steps * (1 if number else 2), student, share)
-        targets = self.codec.encode(visits.actions) if visits.good is None else visits.good.astype(np.float64)
-        self.learner.add(visits.inputs, targets, visits.weights)
-
-    def _rounded(self) -> DecisionList:
-        """Return the best list with as few digits as its episodes allow, its outputs in the unit of actions."""
-        assert self.selection.best is not None
-        score, best = self.selection.best
-        raw = replace(best, controllers=self.codec.to_action_units(best.controllers))
-        states = self.learner.observations[:: max(1, self.learner.n_states // 2000)]
-        exact = self.codec.act_of(best)(states)
-        for digits in _DIGITS:
-            candidate = rounded(raw, digits, self.codec.unit)
-            program = self._program(candidate)
-            changed = self.codec.distance(ProgramAct(program, len(states))(states), exact).mean()
-            if changed > _CHANGED:
-                continue
-            if self.judge.as_good(self.judge.score(ProgramAct(program, len(self.pool)), score), score, share=0.5):
-                return candidate
-        return raw
-
-    def _progress(self, number: int, total: int) -> Imitation:
-        assert self.learner.raw is not None
-        best = self.selection.best
-        raw = self.learner.raw if best is None else best[1]
-        in_units = replace(raw, controllers=self.codec.to_action_units(raw.controllers))
-        return Imitation(
-            number,
-            total,
-            self.learner.n_states,
-            self.selection.result,
-            self.judge.teacher_episodes.summary(),
-            self._program(in_units),
-        )
-
-    def _program(self, raw: DecisionList) -> Program:
-        return to_program(raw, self.spec, self.inputs, self.outputs, self.pool.interaction, **self._metadata)
-
-    @property
-    def _metadata(self) -> dict[str, Any]:
-        return {**self.origin, "learned_by": "imitation", "labelled_states": self.n_labelled or self.learner.n_states}

@@ -21,11 +21,13 @@ class Plain:
     :param candidate: on raw observations
     :param scores: of each series that it has played, the last one last
     :param n_lost: episodes that it lost in them all
+    :param refused: whether it was compared with the best list in vain
     """
 
     candidate: DecisionList
     scores: tuple[float, ...]
     n_lost: int = 0
+    refused: bool = False
 
     @property
     def last(self) -> float:
@@ -34,8 +36,8 @@ class Plain:
 
     @property
     def is_sure(self) -> bool:
-        """Whether it has lost no episode of many."""
-        return len(self.scores) >= _SURE and not self.n_lost
+        """Whether it has lost no episode of many, and is worth a comparison."""
+        return len(self.scores) >= _SURE and not self.n_lost and not self.refused
 
     def and_then(self, score: float, n_lost: int) -> Plain:
         """Return the list with one more score."""

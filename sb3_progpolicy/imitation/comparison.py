@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sb3_progpolicy.imitation.actions import ActionCodec
+from sb3_progpolicy.imitation.arguments import check_tasks, check_whole
 from sb3_progpolicy.imitation.rollouts import Pool, ProgramAct, Variations, play
 from sb3_progpolicy.imitation.tasks import training_variations
 from sb3_progpolicy.imitation.teachers import TeacherLike, make_teacher
@@ -51,7 +52,10 @@ def compare_with_teacher(
     :param n_episodes: on all of them together
     :param seed: of the first episode
     :param env_kwargs: constructor arguments of the environment
+    :raises ValueError: if an argument is not accepted
     """
+    check_tasks(env_id, tasks)
+    check_whole("n_episodes", n_episodes, 1)
     pool = Pool(env_id, min(n_episodes, 24), env_kwargs, program.interaction)
     try:
         env: Any = pool.envs[0]

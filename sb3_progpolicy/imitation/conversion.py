@@ -12,6 +12,9 @@ from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.programs.syntax import Condition, Controller, Expression, IfThenElse
 from sb3_progpolicy.spaces import ActionSpec
 
+#: Significant ones of the numbers of a program; the first that its episodes allow are taken.
+DIGITS = (2, 3, 4, 6)
+
 
 def to_program(
     raw: DecisionList,

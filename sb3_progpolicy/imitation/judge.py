@@ -2,15 +2,42 @@
 
 from __future__ import annotations
 
-from sb3_progpolicy.imitation.rollouts import Act, Episodes, Pool, Variations, Watcher, play
-from sb3_progpolicy.imitation.stalls import Patience
-from sb3_progpolicy.imitation.teachers import Teacher
+import hashlib
+from collections.abc import Sequence
+from typing import Any
 
-#: Of the first episode; no episode of the training has a seed near it.
-VALIDATION_SEED = 50_000_000
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_progpolicy.imitation.rollouts import VALIDATION_SEED, Act, Episodes, Pool, Variations, Watcher, play
+from sb3_progpolicy.imitation.stalls import Patience
+from sb3_progpolicy.imitation.teachers import Observations, Teacher
+
+_DIGEST_STEPS = 50  # of the teacher, by which it is known again
 _FEW_OF, _HOPELESS = 3, 14.0  # of so many episodes one comes first; times the tolerance that these may be below
 _WITH_GOAL, _WITHOUT_GOAL = 24, 96  # episodes of a validation: returns vary more than successes
 _BEFORE_SERIES = 7  # times the number of episodes: those of all other scores
+
+
+class _Digest:
+    """A digest of the actions in the first steps that are watched, to two digits."""
+
+    def __init__(self) -> None:
+        self._hash, self._n_steps = hashlib.sha256(), 0
+
+    def see(self, rows: Sequence[int], inputs: Observations, actions: NDArray[Any], labels: NDArray[Any]) -> None:
+        """See a step; see :class:`~sb3_progpolicy.imitation.rollouts.Watcher`."""
+        if self._n_steps < _DIGEST_STEPS:
+            self._hash.update((np.round(labels[list(rows)].astype(np.float64), 2) + 0.0).tobytes())
+            self._n_steps += 1
+
+    def ended(self, row: int, success: bool) -> None:
+        """See the end of an episode; see :class:`~sb3_progpolicy.imitation.rollouts.Watcher`."""
+
+    @property
+    def hexadecimal(self) -> str:
+        """The digest."""
+        return self._hash.hexdigest()
 
 
 class Judge:
@@ -28,7 +55,11 @@ class Judge:
     ) -> None:
         self.pool, self.variations, self.tolerance = pool, variations, tolerance
         self.teacher = teacher
-        self.teacher_episodes = play(pool, variations, n_episodes or _WITH_GOAL, VALIDATION_SEED, None, teacher)
+        digest = _Digest()
+        first = n_episodes or _WITH_GOAL
+        self.teacher_episodes = play(pool, variations, first, VALIDATION_SEED, None, teacher, watcher=digest)
+        #: Of what the teacher does in its first steps.
+        self.teacher_digest = digest.hexadecimal
         self.n_episodes = n_episodes or (_WITH_GOAL if len(self.teacher_episodes.successes) else _WITHOUT_GOAL)
         if more := self.n_episodes - len(self.teacher_episodes.returns):
             seed = VALIDATION_SEED + self.n_episodes - more

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_progpolicy.imitation.actions import ActionCodec
+from sb3_progpolicy.imitation.conversion import DIGITS
 from sb3_progpolicy.imitation.recurrent import Sequences, fit_sequences, map_numbers, rounded_body
 from sb3_progpolicy.imitation.rollouts import Act, ProgramAct
 from sb3_progpolicy.imitation.visits import Collector
@@ -21,7 +22,6 @@ SHARES = (1.0, 0.5, 0.3, 0.1, 0.0, 0.0)
 _FEW = 3  # conditions before the last round
 _SIZES = (1, 2, 3, 4, 6, 8, 11)  # numbers of conditions tried in the last one
 _N_STEPS = 300  # of Adam
-_DIGITS = (2, 3, 4, 6)
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,9 @@ class MemoryRun:
     :param to_program: makes a program of its body
     :param score: of a program's episodes; more is better
     :param as_good: whether one score is as good as another
-    :param after_round: is called with the number of rounds done, of rounds in all and of states, and the best program
+    :param last_result: returns the means of the episodes that were scored last
+    :param after_round: is called with the number of rounds done, of rounds in all and of states, the best program and
+        the means of its episodes
     """
 
     collector: Collector
@@ -49,7 +51,8 @@ class MemoryRun:
     to_program: Callable[[Expression], Program]
     score: Callable[[Program], float]
     as_good: Callable[[float, float], bool]
-    after_round: Callable[[int, int, int, Program], None]
+    last_result: Callable[[], Mapping[str, float]]
+    after_round: Callable[[int, int, int, Program, Mapping[str, float]], None]
 
 
 def imitate_with_memory(run: MemoryRun, n_steps: int) -> Program:
@@ -61,6 +64,7 @@ def imitate_with_memory(run: MemoryRun, n_steps: int) -> Program:
     parts: list[Any] = []
     present: Program | None = None
     best: tuple[float, Program] | None = None
+    result: Mapping[str, float] = {}
     for number, share in enumerate(SHARES):
         run.collector.begin()
         act: Act | None = None if present is None else ProgramAct(present, len(run.collector.pool))
@@ -74,9 +78,9 @@ def imitate_with_memory(run: MemoryRun, n_steps: int) -> Program:
             reached = run.score(present)
             shorter = best is not None and size < len(best[1].conditions) and run.as_good(reached, best[0])
             if best is None or reached > best[0] or shorter:
-                best = reached, present
+                best, result = (reached, present), run.last_result()
         assert best is not None
-        run.after_round(number + 1, len(SHARES), int((data.weights > 0).sum()), best[1])
+        run.after_round(number + 1, len(SHARES), int((data.weights > 0).sum()), best[1], result)
     assert best is not None
     return _rounded(run, best)
 
@@ -98,7 +102,7 @@ def _in_units(body: Expression, codec: ActionCodec) -> Expression:
 
 def _rounded(run: MemoryRun, best: tuple[float, Program]) -> Program:
     score, program = best
-    for digits in _DIGITS:
+    for digits in DIGITS:
         candidate = run.to_program(rounded_body(program.body, digits))
         if run.as_good(run.score(candidate), score):
             return candidate

@@ -13,13 +13,16 @@ from numpy.typing import NDArray
 from sb3_progpolicy.env_ids import spec_of
 from sb3_progpolicy.imitation.augmentation import Begin
 from sb3_progpolicy.imitation.stalls import Patience
-from sb3_progpolicy.imitation.teachers import Observations, Situation, Teacher, join_history
+from sb3_progpolicy.imitation.teachers import Observations, Situation, Teacher, checked_labels, join_history
 from sb3_progpolicy.programs.interpreter import ProgramRunner, Semantics
 from sb3_progpolicy.programs.syntax import ProgramData
+from sb3_progpolicy.reptile.options import ReadOptions, unread_names
 from sb3_progpolicy.spaces import action_spec, check_observation_space
 
 Act = Callable[[Observations], NDArray[Any]]
 Variations = Sequence[Mapping[str, Any]]
+#: Of the first episode of a validation; no episode of the training has a seed near it.
+VALIDATION_SEED = 50_000_000
 _STEPS_COUNT = 0.1  # a tenth more steps than the teacher's are as bad as one failure in a hundred
 
 
@@ -42,7 +45,7 @@ class Pool:
         interaction: bool = False,
         begin: Begin | None = None,
     ) -> None:
-        self.interaction, self._begin = interaction, begin
+        self.interaction, self._begin, self.env_kwargs = interaction, begin, dict(env_kwargs or {})
         spec = spec_of(env_id)
         self.envs: list[Any] = [gym.make(spec.id, **(env_kwargs or {})) for _ in range(n_envs)]
         space = check_observation_space(self.envs[0].observation_space)
@@ -67,19 +70,44 @@ class Pool:
         self.actions, self.dones[:], self.rewards[:] = None, False, 0
 
     def reset(self, row: int, seed: int, variation: Mapping[str, Any]) -> None:
-        """Begin an episode."""
+        """Begin an episode.
+
+        :raises ValueError: if the environment does not read what the variation says
+        """
         if self._begin is not None:
             self.observations[row] = self._begin(self.envs[row], seed, variation)
-        else:
-            self.observations[row] = self.envs[row].reset(seed=seed, options=dict(variation) or None)[0]
+            return
+        options = ReadOptions(variation)
+        self.observations[row] = self.envs[row].reset(seed=seed, options=options if variation else None)[0]
+        if variation and (unread := unread_names([options])):
+            raise ValueError(
+                f"the reset option {', '.join(sorted(unread))} has no effect; {self.envs[row].spec.id} does not read it"
+            )
 
     def situation(self, rows: Sequence[int] | None = None) -> Situation:
         """Return what a teacher may look at."""
         envs = self.envs if rows is None else [self.envs[row] for row in rows]
         return Situation(self.observations.copy(), envs, self.actions, self.rewards.copy(), self.dones.copy())
 
+    def labels(self, teacher: Teacher, rows: Sequence[int] | None = None) -> NDArray[Any]:
+        """Return what a teacher would do now, ``(n_envs,)`` if Discrete, else ``(n_envs, n_numbers)``.
+
+        :param teacher: is asked
+        :param rows: to ask about; by default all
+        """
+        situation = self.situation(rows)
+        return checked_labels(teacher.label(situation), self.spec, len(situation.envs), teacher.name)
+
+    def labels_alone(self, teacher: Teacher, observations: Observations) -> NDArray[Any]:
+        """Return what a teacher would do where no environment is; see :meth:`labels`."""
+        return checked_labels(
+            teacher.label_alone(observations, self.envs[0]), self.spec, len(observations), teacher.name
+        )
+
     def step(self, row: int, action: Any) -> tuple[bool, dict[str, Any]]:
         """Take one step; return whether the episode ended, and the infos."""
+        if self.spec.kind == "box":
+            action = np.reshape(action, self.envs[row].action_space.shape)
         observation, reward, terminated, truncated, info = self.envs[row].step(action)
         self.observations[row], self.rewards[row] = observation, float(reward)
         self.dones[row] = terminated or truncated
@@ -235,8 +263,8 @@ def _labels(pool: Pool, teacher: Teacher | None, live: Sequence[int]) -> NDArray
     """Return labels of all rows; a planner is not asked about episodes that have ended."""
     assert teacher is not None
     if len(live) == len(pool) or teacher.name != "planner":
-        return teacher.label(pool.situation())
-    found = teacher.label(pool.situation(live))
+        return pool.labels(teacher)
+    found = pool.labels(teacher, live)
     labels = np.zeros((len(pool), *found.shape[1:]), dtype=found.dtype)
     labels[list(live)] = found
     return labels

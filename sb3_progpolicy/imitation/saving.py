@@ -32,6 +32,7 @@ class State:
     :param runners_up: the best few with their scores
     :param result: of the best list in its validation
     :param reference: value of the best list before it was made smaller
+    :param has_goal: whether an episode that was visited told of success
     """
 
     number: int
@@ -46,6 +47,7 @@ class State:
     runners_up: tuple[Scored, ...]
     result: Mapping[str, float]
     reference: float
+    has_goal: bool
 
 
 def save_state(path: Path, origin: Mapping[str, Any], state: State) -> None:
@@ -72,9 +74,10 @@ def save_state(path: Path, origin: Mapping[str, Any], state: State) -> None:
         "generators": state.generators,
         "has_best": state.best is not None,
         "scores": [score for score, _ in scored],
-        "plain": [(plain.scores, plain.n_lost) for plain in state.plain],
+        "plain": [(plain.scores, plain.n_lost, plain.refused) for plain in state.plain],
         "result": dict(state.result),
         "reference": state.reference,
+        "has_goal": state.has_goal,
     }
     content = io.BytesIO()
     np.savez_compressed(
@@ -110,13 +113,14 @@ def load_state(path: Path, origin: Mapping[str, Any]) -> State:
             weights=parts["weights"],
             present=_list(parts, "present") if "present_controllers" in parts else None,
             plain=tuple(
-                Plain(_list(parts, f"plain{index}"), tuple(scores), n_lost)
-                for index, (scores, n_lost) in enumerate(about["plain"])
+                Plain(_list(parts, f"plain{index}"), tuple(scores), n_lost, refused)
+                for index, (scores, n_lost, refused) in enumerate(about["plain"])
             ),
             best=scored[0] if about["has_best"] else None,
             runners_up=tuple(scored[int(about["has_best"]) :]),
             result=about["result"],
             reference=about["reference"],
+            has_goal=about["has_goal"],
         )
     except (OSError, EOFError, ValueError, KeyError, TypeError, IndexError) as error:
         raise ValueError(f"{path} is not the state of an imitation: {error}; remove it to begin anew") from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -56,7 +57,6 @@ class Selection:
         self.plain: list[Plain] = []
         #: Whether a plain list was taken over.
         self.is_plain = False
-        self._refused: list[DecisionList] = []  # plain lists of which none was taken
         self._witness: Witness | None = None  # of what the plain lists saw in the present round
 
     def offer(self, candidate: DecisionList, sparse: bool = False) -> None:
@@ -121,7 +121,7 @@ class Selection:
         if self._witness is None:
             return
         visits = self._witness.visits(n_states, self.learner.rng)
-        visits = visits.with_changed(self.augment, self.judge.teacher, self.judge.pool.envs[0], self.learner.rng)
+        visits = visits.with_changed(self.augment, self.judge.teacher, self.judge.pool, self.learner.rng)
         self.learner.add(visits.inputs, self.codec.encode(visits.actions), visits.weights)
         self._witness = None
 
@@ -146,7 +146,7 @@ class Selection:
             self.learner.raw, self.reference = self.best[1], self.best[0]
             self.result = self.judge.last_result
         else:
-            self._refused += candidates
+            self.plain = [replace(plain, refused=True) for plain in self.plain]
 
     def _costs_little(self, chosen: DecisionList, merit: float, needed: Sequence[float]) -> bool:
         """Return whether a plain list of a merit is nearly as good as the best list."""
@@ -158,7 +158,7 @@ class Selection:
     @property
     def is_sure(self) -> bool:
         """Whether one of the best plain lists has lost no episode of many, and was not compared in vain before."""
-        return any(one.is_sure and not any(one.candidate is other for other in self._refused) for one in self.plain)
+        return any(plain.is_sure for plain in self.plain)
 
     def make_sparse(self) -> None:
         """Go on with the program of fewest inputs whose episodes are as good as the best ones.

@@ -58,6 +58,36 @@ def join_history(
     return np.concatenate((observations, previous, rewards[:, None], dones[:, None]), axis=1, dtype=np.float32)
 
 
+def checked_labels(labels: Any, spec: ActionSpec, n_rows: int, name: str) -> NDArray[Any]:
+    """Return what a teacher said as actions: ``(n_rows,)`` whole numbers if Discrete, else ``(n_rows, n_numbers)``.
+
+    :param labels: what it returned
+    :param spec: the action space
+    :param n_rows: number of observations that it was asked about
+    :param name: of the teacher
+    :raises ValueError: if these are not actions of the space, one for each observation
+    """
+    given = np.asarray(labels)
+    is_box, kinds = spec.kind == "box", "fiub" if spec.kind == "box" else "iub"
+    width = len(spec.low) if is_box else 1
+    if given.dtype.kind in kinds and given.ndim and len(given) == n_rows and given.size == n_rows * width:
+        if is_box:
+            actions = given.reshape(n_rows, width).astype(given.dtype if given.dtype.kind == "f" else np.float32)
+            if np.isfinite(actions).all():
+                return actions
+        else:
+            numbers = given.reshape(n_rows).astype(np.int64)
+            if n_rows == 0 or (numbers.min() >= spec.start and numbers.max() < spec.start + spec.sizes[0]):
+                return numbers
+    last = spec.start + spec.sizes[0] - 1
+    accepted = f"{width} finite numbers" if is_box else f"a whole number from {spec.start} to {last}"
+    shown = " ".join(str(given).split())
+    raise ValueError(
+        f"the teacher {name} returned {shown if len(shown) < 100 else shown[:100] + ' ...'} of shape {given.shape} and "
+        f"type {given.dtype} for {n_rows} observations; accepted are arrays of {n_rows} actions, each {accepted}"
+    )
+
+
 class Teacher(Protocol):
     """Labels states with actions."""
 
@@ -134,13 +164,7 @@ class FunctionTeacher:
 
     def label(self, situation: Situation) -> NDArray[Any]:
         """See :meth:`Teacher.label`."""
-        actions = np.asarray(self.function(situation.observations))
-        if len(actions) != len(situation.observations):
-            raise ValueError(
-                f"the teacher {self.name} returned actions of the shape {actions.shape} for "
-                f"{len(situation.observations)} observations; one action for each is accepted"
-            )
-        return actions
+        return np.asarray(self.function(situation.observations))
 
     def label_alone(self, observations: Observations, env: Any) -> NDArray[Any]:
         """See :meth:`Teacher.label_alone`."""
@@ -257,11 +281,11 @@ def make_teacher(teacher: TeacherLike, env: Any) -> Teacher:
 
 def _needs_states(name: str) -> ValueError:
     return ValueError(
-        f"augment is not accepted for the teacher {name}, which needs more than an observation; functions and scripted "
-        "controllers do not"
+        f"augment is not accepted for the teacher {name}, which is asked about states of an episode; functions and "
+        "scripted controllers are asked about any observation"
     )
 
 
 def _not_a_teacher(given: object) -> ValueError:
-    accepted = "it is 'planner', a model of Stable-Baselines3 or a function from observations to actions"
+    accepted = "it is 'planner', a model of Stable-Baselines3, a program, or a function from observations to actions"
     return ValueError(f"teacher={given!r} is not accepted; {accepted}")

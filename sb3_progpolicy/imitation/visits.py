@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_progpolicy.imitation.augmentation import Augment
-from sb3_progpolicy.imitation.rollouts import Act, Pool, Variations
+from sb3_progpolicy.imitation.rollouts import VALIDATION_SEED, Act, Pool, Variations
 from sb3_progpolicy.imitation.stalls import VISITS, Stalls
 from sb3_progpolicy.imitation.teachers import Observations, PlannerTeacher, Teacher
 
@@ -19,6 +19,7 @@ _RESCUE = 10  # steps of the teacher out of a stall
 _LAST_STEPS = 25  # steps before an episode is lost, of which some may have lost it
 _WRONG = 0.25  # share of half the range of an action that it differs by from the teacher's, and more
 STALL_WEIGHT = 3.0
+_SEEDS = 100_000  # of the episodes of a seed; those of the validations are left out
 _NOISE = 0.15  # of the first round, in which only the teacher acts
 _TELLING = 0.5  # share of the states of judged episodes that are those in which the candidate does otherwise
 
@@ -38,8 +39,8 @@ def differ(space: Any, actions: NDArray[Any], labels: NDArray[Any]) -> NDArray[n
 
 
 def _half_range(space: Any) -> NDArray[np.float64]:
-    """Return half the range of each number of an action; 1 where it has no bounds."""
-    return np.where(np.isfinite(space.high - space.low), (space.high - space.low) / 2, 1.0)
+    """Return half the range of each number of an action, ``(n_numbers,)``."""
+    return np.asarray((space.high - space.low) / 2, dtype=np.float64).ravel()
 
 
 @dataclass
@@ -47,7 +48,7 @@ class Visits:
     """States visited, with labels.
 
     :param inputs: what a student reads, ``(n, n_inputs)``
-    :param actions: the teacher's, ``(n, *action_shape)``
+    :param actions: the teacher's, ``(n,)`` if Discrete, else ``(n, n_numbers)``
     :param weights: ``(n,)``; more where the student gets nowhere or loses an episode
     :param n_stalls: how often it got nowhere
     :param ended: success and steps of the episodes that ended
@@ -61,12 +62,12 @@ class Visits:
     ended: list[tuple[bool, int]] = field(default_factory=list)
     good: NDArray[np.bool_] | None = None
 
-    def with_changed(self, augment: Augment | None, teacher: Teacher, env: Any, rng: np.random.Generator) -> Visits:
+    def with_changed(self, augment: Augment | None, teacher: Teacher, pool: Pool, rng: np.random.Generator) -> Visits:
         """Return these states with changed copies of half of them, which the teacher labels too.
 
         :param augment: changes observations; ``None`` changes nothing
         :param teacher: labels the copies
-        :param env: that they are of
+        :param pool: environments that they are of
         :param rng: source of the draws
         """
         if augment is None:
@@ -75,7 +76,7 @@ class Visits:
         return replace(
             self,
             inputs=np.concatenate([self.inputs, changed]),
-            actions=np.concatenate([self.actions, teacher.label_alone(changed, env)]),
+            actions=np.concatenate([self.actions, pool.labels_alone(teacher, changed)]),
             weights=np.append(self.weights, np.ones(len(changed))),
         )
 
@@ -112,12 +113,13 @@ class Collector:
         chances = np.array([2.0 ** min(rank, 6) / ranks.count(rank) for rank in ranks])
         self.chances = chances / chances.sum()
         self.rng = np.random.default_rng(seed)
-        self.next_seed = 100_000 * (seed + 1)
+        self.next_seed = _SEEDS * (seed + 1 if _SEEDS * (seed + 1) < VALIDATION_SEED else seed + 2)
         self.limit = pool.cap if limit is None else limit
         self._guided, self._left = np.zeros(len(pool), dtype=bool), np.zeros(len(pool), dtype=np.int64)
         self._elapsed = np.zeros(len(pool), dtype=np.int64)
         self.stalls = Stalls(len(pool))
-        self._has_goal = False
+        #: Whether an episode has told of success.
+        self.has_goal = False
 
     def begin(self) -> None:
         """Begin episodes in all environments."""
@@ -143,7 +145,7 @@ class Collector:
             seen = pool.inputs
             stalled = self._stalled(seen)
             visits.n_stalls += int(stalled.sum())
-            label = self.teacher.label(pool.situation())
+            label = pool.labels(self.teacher)
             inputs.append(seen)
             labels.append(label)
             if knows_all:
@@ -162,7 +164,7 @@ class Collector:
             for row in range(len(pool)):
                 ended, info = pool.step(row, actions[row])
                 self._elapsed[row] += 1
-                self._has_goal = self._has_goal or "is_success" in info
+                self.has_goal = self.has_goal or "is_success" in info
                 if ended or self._elapsed[row] >= self.limit:
                     if ended and student is not None and not info.get("is_success", True):
                         for earlier in range(max(first[row], step + 1 - _LAST_STEPS), step + 1):
@@ -175,7 +177,7 @@ class Collector:
         visits.weights = np.concatenate(weights)
         if isinstance(self.teacher, PlannerTeacher) and knows_all:
             visits.good = self.teacher.good_actions(states)
-        return visits.with_changed(self.augment, self.teacher, pool.envs[0], rng)
+        return visits.with_changed(self.augment, self.teacher, pool, rng)
 
     def _reset(self, row: int) -> None:
         choice = int(self.rng.choice(len(self.variations), p=self.chances))
@@ -187,7 +189,7 @@ class Collector:
 
     def _stalled(self, inputs: Observations) -> NDArray[np.bool_]:
         """Return which environments are in a state for the third time, or a later one, in this episode."""
-        if not self._has_goal:
+        if not self.has_goal:
             return np.zeros(len(self.pool), dtype=bool)
         return self.stalls.visits(self.pool.envs, inputs) >= VISITS
 
@@ -196,7 +198,7 @@ class Collector:
         space: Any = self.pool.envs[0].action_space
         if np.issubdtype(actions.dtype, np.floating):
             noisy = actions + _NOISE * _half_range(space) * self.rng.normal(size=actions.shape)
-            return np.clip(noisy, space.low, space.high).astype(actions.dtype)
+            return np.clip(noisy, space.low.ravel(), space.high.ravel()).astype(actions.dtype)
         drawn = self.rng.integers(space.start, space.start + space.n, size=actions.shape)
         return np.where(self.rng.random(actions.shape) < _NOISE, drawn, actions)
 

@@ -22,7 +22,7 @@ def load_pretrained(name: str) -> Program:
     :return: the program, plain data that needs no torch
     :raises ValueError: if there is none of that name; the message names the nearest ones
     """
-    bare = name.rpartition(":")[2]
+    bare = str(name).rpartition(":")[2]
     if bare not in pretrained_names():
         raise unknown("pretrained program", name, pretrained_names())
     with as_file(files(__name__) / f"{bare}.json") as path:

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from progpolicy_envs.panda import PandaStackEnv
 from sb3_progpolicy import compare_with_teacher, evaluate_program, imitate, load_pretrained
 from sb3_progpolicy.cli import run
-from sb3_progpolicy.imitation import algorithm, make_teacher
+from sb3_progpolicy.imitation import algorithm, make_teacher, rounds
 from sb3_progpolicy.imitation.augmentation import begun_towers, taller_towers
 from sb3_progpolicy.imitation.decision_list import DecisionList
 from sb3_progpolicy.imitation.learner import Settings
@@ -92,7 +92,7 @@ def test_taller_towers_are_labelled_by_the_scripted_controller():
     assert {names[column] for column in np.flatnonzero(raised.any(axis=0))} == {"gripper_z", "target_z", "object_z"}
     with pytest.raises(ValueError, match="has no gripper_z"):
         imitate("planner", "Stacking-v0", augment="taller_towers")
-    with pytest.raises(ValueError, match="needs more than an observation"):
+    with pytest.raises(ValueError, match="is asked about states of an episode"):
         imitate("planner", "Stacking-v0", augment=lambda observations, rng: observations, **SMALL)
 
 
@@ -154,14 +154,14 @@ def test_interrupted_imitation_goes_on_as_if_nothing_had_happened(balanced, tmp_
     assert program.metadata["labelled_states"] == 13 * (2000 // 13)
     with pytest.raises(ValueError, match="remove it to begin anew"):
         imitate(balance, "CartPole-v1", seed=9, checkpoint=state, **SMALL)
-    more = {**SMALL, "score_tolerance": 0.1, "plain_tolerance": 0.2}
-    with pytest.raises(ValueError, match="another score_tolerance, plain_tolerance;"):
+    more = {**SMALL, "score_tolerance": 0.1, "max_conditions": 2}
+    with pytest.raises(ValueError, match="another max_branches, score_tolerance;"):
         imitate(balance, "CartPole-v1", seed=1, checkpoint=state, **more)
 
 
 def test_branches_that_hardly_ever_act_go_while_episodes_stay_as_good():
     with Pool("CartPole-v1", 8) as pool:
-        run = algorithm._Run(pool, balance, "CartPole-v1", None, Settings(3, 0), (), 8, (0.015, 0.05), None)
+        run = rounds.Run(pool, balance, "CartPole-v1", None, Settings(3, 0), (), 8, (0.015, None), None)
         states = np.random.default_rng(0).normal(scale=0.1, size=(500, 4)).astype(np.float32)
         run.learner.add(states, run.codec.encode(balance(states)), np.ones(500))
         rule = np.array([[-0.1, -0.5, -1, -1, 0], [0.1, 0.5, 1, 1, 0]]) * 20
@@ -220,7 +220,7 @@ def test_imitation_takes_one_thread_of_blas_and_leaves_the_others_as_they_were()
         ({"plain_tolerance": float("nan")}, "plain_tolerance=nan are not accepted"),
         ({"tasks": []}, "at least one variation"),
         ({"env_id": "CartPol-v1"}, "unknown environment"),
-        ({"teacher": lambda observations: np.zeros(1)}, "one action for each"),
+        ({"teacher": lambda observations: np.zeros(1)}, "for 24 observations"),
     ],
 )
 def test_what_is_not_accepted_is_said(arguments, message):
@@ -336,7 +336,7 @@ def test_each_size_is_drawn_twice_as_often_as_the_one_before():
 
 
 def test_command_line_distills_a_planner(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(algorithm, "N_ROUNDS", 3)
+    monkeypatch.setattr(rounds, "N_ROUNDS", 3)
     output = tmp_path / "program.json"
     arguments = ["distill", "--from", "planner", "--env", "Stacking-v0", "--set", "n_plates=1", "-n", "1000"]
     assert run([*arguments, "--max-conditions", "2", "--episodes", "4", "-o", str(output)]) == 0

@@ -9,10 +9,12 @@ from gymnasium import spaces
 
 from sb3_progpolicy import evaluate_program, imitate
 from sb3_progpolicy.imitation import algorithm, memory, recurrent
+from sb3_progpolicy.imitation.judge import Judge
 from sb3_progpolicy.imitation.learner import Settings
 from sb3_progpolicy.imitation.losses import DiscreteLoss
 from sb3_progpolicy.imitation.recurrent import Sequences, fit_sequences, map_numbers, rounded_body
 from sb3_progpolicy.imitation.rollouts import Pool, ProgramAct, play
+from sb3_progpolicy.imitation.teachers import make_teacher
 from sb3_progpolicy.programs import Program, ProgramRunner
 
 FORWARD, LEFT, RIGHT = 0, 1, 2
@@ -62,8 +64,13 @@ SMALL = {"n_timesteps": 600, "n_envs": 8, "n_episodes": 24}
 
 
 @pytest.fixture(scope="module")
-def remembering(maze):
-    return imitate("planner", "TMaze-v0", cell="gru", max_conditions=1, **SMALL)
+def seen():
+    return []
+
+
+@pytest.fixture(scope="module")
+def remembering(maze, seen):
+    return imitate("planner", "TMaze-v0", cell="gru", max_conditions=1, callback=seen.append, **SMALL)
 
 
 def success_rate(program):
@@ -107,6 +114,15 @@ def test_rounding_changes_numbers_and_nothing_else(remembering):
     for old, new in zip(remembering.body.condition.bias_hh, condition.bias_hh, strict=True):
         assert new == float(f"{old:.0e}")
     assert condition.cell == "gru"
+
+
+def test_result_is_that_of_the_best_program(remembering, seen):
+    with Pool("TMaze-v0", 8) as pool:
+        judge = Judge(pool, [{}], 24, 0.015, make_teacher("planner", pool.envs[0]))
+        judge.patience = None
+        for so_far in seen:
+            judge.score(ProgramAct(so_far.program, 8))
+            assert so_far.result == judge.last_result
 
 
 @pytest.mark.parametrize(
