@@ -1,5 +1,7 @@
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium as gym
 import pytest
@@ -32,6 +34,14 @@ def test_every_shipped_program_loads():
     names = pretrained_names()
     assert "Hanoi-v0" in names
     assert [load_pretrained(name).metadata["env"] for name in names] == names
+
+
+def test_guide_prints_programs_as_they_are():
+    guide = Path(__file__).parents[1].joinpath("docs/guide/imitation.md").read_text(encoding="utf-8")
+    printed = re.findall(r"as `progpolicy show (\S+)` prints it.*?```text\n(.*?)```", guide, flags=re.DOTALL)
+    assert {name for name, _ in printed} == {"PandaPush-v0", "PandaSlide-v0", "PandaStack-v0"}
+    for name, text in printed:
+        assert text.rstrip() in str(load_pretrained(name)), name
 
 
 def test_loading_needs_no_torch():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable
 from typing import Any
 
@@ -39,8 +40,13 @@ class ActionCodec:
         self.unit = self.half if spec.kind == "box" else np.ones(spec.n_outputs)
 
     def loss(self) -> Loss:
-        """Return the loss of this action space; outputs named ``move_x``, ``move_y`` ... are one vector."""
+        """Return the loss of this action space; outputs named ``move_x``, ``move_y`` ... are one vector.
+
+        :raises ImportError: if the actions are Discrete and SciPy is missing
+        """
         if self.spec.kind == "discrete":
+            if importlib.util.find_spec("scipy") is None:
+                raise ImportError('imitate with Discrete actions needs SciPy: pip install "sb3-progpolicy[imitation]"')
             return DiscreteLoss()
         moves = tuple(index for index, name in enumerate(self.names) if name.startswith("move_"))
         return BoxLoss(np.ones(self.spec.n_outputs, dtype=bool), moves if len(moves) > 1 else ())

@@ -71,12 +71,7 @@ def fit_sparse_condition(
     full, value = fit_condition(inputs, gains, start, ridges=(1e-3,))
     if full is None:
         return start
-    rows, costs = _sample(gains)
-    some, costs = inputs[rows], costs / costs.mean()
-    paths = [
-        _elimination(some, costs, direction)
-        for direction in (logistic(some, gains[rows] > 0, costs, None, 1e-4), _SHARPNESS * full)
-    ]
+    paths = _paths(inputs, gains, full)
     best, most = full, -np.inf
     for size in _SUPPORTS:
         found = []
@@ -97,6 +92,14 @@ def fit_sparse_condition(
     return best if always_few else full
 
 
+def _paths(inputs: Floats, gains: Floats, full: Floats) -> list[list[tuple[np.ndarray, Floats]]]:
+    """Return which inputs are left when they go one by one: of a fit without a start, and of a known condition."""
+    rows, costs = _sample(gains)
+    some, costs = inputs[rows], costs / costs.mean()
+    directions = (logistic(some, gains[rows] > 0, costs, None, 1e-4), _SHARPNESS * full)
+    return [_elimination(some, costs, direction) for direction in directions]
+
+
 def fit_priced_condition(
     inputs: Floats, gains: Floats, start: Floats, price: float, most: int = 4
 ) -> tuple[Floats | None, float]:
@@ -112,10 +115,7 @@ def fit_priced_condition(
     full, _ = fit_condition(inputs, gains, start, ridges=(1e-3,))
     if full is None:
         return None, 0.0
-    rows, costs = _sample(gains)
-    some, costs = inputs[rows], costs / costs.mean()
-    directions = (logistic(some, gains[rows] > 0, costs, None, 1e-4), _SHARPNESS * full)
-    paths = [_elimination(some, costs, direction) for direction in directions]
+    paths = _paths(inputs, gains, full)
     supports = [
         next(step for step in path if step[0].sum() <= size + 1) for size in range(1, most + 1) for path in paths
     ]

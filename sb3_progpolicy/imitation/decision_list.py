@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,13 +33,6 @@ class Data:
         :param rows: a mask or indices
         """
         return Data(self.inputs[rows], self.targets[rows], self.weights[rows])
-
-    def weighted(self, factors: Floats) -> Data:
-        """Return the same states with their weights multiplied.
-
-        :param factors: ``(n,)``
-        """
-        return replace(self, weights=self.weights * factors)
 
 
 @dataclass(frozen=True)
@@ -159,18 +152,6 @@ class DecisionList:
             self.conditions[left],
             np.delete(self.controllers, index, axis=0),
             self.owners[left] - (self.owners[left] > condition),
-        )
-
-    def moved(self, old: Scaler, new: Scaler) -> DecisionList:
-        """Return the same list on inputs that are standardised otherwise.
-
-        :param old: of this list
-        :param new: of the list returned
-        """
-        return replace(
-            self,
-            conditions=new.from_raw(old.to_raw(self.conditions)),
-            controllers=new.from_raw(old.to_raw(self.controllers)),
         )
 
 

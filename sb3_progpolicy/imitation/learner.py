@@ -237,7 +237,6 @@ class Learner:
         order = [int(index) for index in np.argsort(losses) if losses[index] <= _COMPETES * losses.min() + 1e-9]
         chosen = [_raw(candidates[index], scaler) for index in order]
         self.raw = chosen[0]
-        self.last_loss = float(losses.min())
         return chosen
 
 
