@@ -14,13 +14,14 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_wrapper
 
 from progpolicy_envs import find_domain
+from sb3_progpolicy.bounds import check_whole
 from sb3_progpolicy.env_ids import id_from_file, spec_of
 from sb3_progpolicy.extraction import extract_program, holds_program, wrappers_of
 from sb3_progpolicy.interaction import VecInteractionHistory
 from sb3_progpolicy.programs.interpreter import ProgramRunner, Semantics, join_inputs
 from sb3_progpolicy.programs.syntax import ProgramData
 from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, unread_names
-from sb3_progpolicy.spaces import action_spec, interaction_space
+from sb3_progpolicy.spaces import action_spec, interaction_space, shaped
 from sb3_progpolicy.vec_env import BatchedVecEnv, make_fast_vec_env
 
 Act = Callable[[NDArray[Any], NDArray[np.float32], NDArray[np.bool_]], NDArray[Any]]
@@ -88,12 +89,16 @@ def evaluate_program(
     :param semantics: ``"crisp"`` or ``"soft"``
     :param seed: variation ``i`` is seeded with ``seed + i``
     :param max_steps: cap of an episode in place of the registered one
-    :param env_kwargs: constructor arguments common to all variations
+    :param env_kwargs: constructor arguments common to all variations; by default those in the program's metadata, if it
+        is its environment
     :param watch: is called at each step with X ``(n_envs, n_inputs)`` and the index of the branch taken ``(n_envs,)``
     :return: one row for each variation
     :raises ValueError: if an argument is not accepted or the program does not fit the environment
     """
-    env_id = env_id or id_from_file(program.metadata.get("env"))
+    own_id = id_from_file(program.metadata.get("env"))
+    if env_kwargs is None and env_id in (None, own_id):
+        env_kwargs = _mapping("the program's env_kwargs", program.metadata.get("env_kwargs", {}))
+    env_id = env_id or own_id
     if not env_id:
         raise ValueError("the program does not say which environment it is for, or names a module; give env_id")
 
@@ -116,7 +121,7 @@ def evaluate_program(
             previous = runner.act(inputs)
             if watch is not None:
                 watch(inputs, runner.branch)
-            return previous
+            return shaped(previous, venv.action_space)
 
         return act
 
@@ -146,6 +151,8 @@ def evaluate_model(
 
     def prepare(venv: VecEnv) -> VecEnv:
         assert model.observation_space is not None
+        if model.action_space != venv.action_space and not _alike(model.action_space, venv.action_space):
+            raise ValueError(f"the model acts in {model.action_space}; {env_id} has {venv.action_space}")
         if normalizer is not None:
             venv = _normalized(venv, normalizer)
         if venv.observation_space.shape == model.observation_space.shape:
@@ -193,6 +200,17 @@ def evaluate_any(
     ]
 
 
+def _alike(one: Any, other: Any) -> bool:
+    """Return whether two action spaces are described alike, whatever their classes."""
+    return isinstance(one, type(other)) and action_spec(one) == action_spec(other)
+
+
+def _mapping(name: str, value: Any) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{name}={value!r} is not accepted; it is a mapping")
+    return value
+
+
 def refuse_wrappers(what: str, wrappers: Sequence[str]) -> None:
     """Raise ``ValueError`` if something was trained in wrappers that an environment's id does not bring back.
 
@@ -235,8 +253,19 @@ def _evaluate(
     prepare: Callable[[VecEnv], VecEnv],
     start: Callable[[VecEnv], Act],
 ) -> list[Evaluation]:
-    if n_episodes < 1:
-        raise ValueError(f"n_episodes={n_episodes} is not accepted; it is at least 1")
+    check_whole("n_episodes", n_episodes, 1)
+    check_whole("seed", seed, 0)
+    if max_steps is not None:
+        check_whole("max_steps", max_steps, 1)
+    if not isinstance(env_id, str):
+        raise ValueError(f"env_id={env_id!r} is not accepted; it is the id of an environment, such as 'CartPole-v1'")
+    if isinstance(variations, (str, Mapping)) or not all(isinstance(one, Mapping) for one in variations):
+        raise ValueError(
+            f"variations={variations!r} is not accepted; it is a sequence of mappings, such as [{{'n_discs': 5}}]"
+        )
+    arguments = dict(env_kwargs or {})
+    registered = arguments.pop("max_episode_steps", None)
+    max_steps = registered if max_steps is None else max_steps
     spec = spec_of(env_id)
     cap = max_steps if max_steps is not None else spec.max_episode_steps
     if cap is None or cap < 1:
@@ -245,7 +274,6 @@ def _evaluate(
     domain = find_domain(env_id)
     # In a batch those that have finished go on until the last has, which is expensive where a step is a simulation.
     batched = spec.vector_entry_point is not None and not (domain is not None and domain.simulation)
-    arguments = dict(env_kwargs or {})
     # Parameters that a domain's environment reads as options are known; another's constructor may be where they go.
     by_constructor = (
         set().union(*(constructor_arguments(env_id, one, arguments) for one in _one_of_each_kind(variations)))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -24,7 +26,7 @@ from sb3_progpolicy.programs.transform import fold_normalization
 # Wrappers of which a program knows what they do, or that do nothing to what it sees.
 _KNOWN = (VecMonitor, VecInteractionHistory, VecNormalize, VecCheckNan, VecVideoRecorder)
 _HARMLESS = {"Monitor", "RecordEpisodeStatistics", "RecordVideo", "HumanRendering", "RenderCollection", "TimeLimit"}
-_HARMLESS |= {"OrderEnforcing", "PassiveEnvChecker", "InteractionHistory", "RemakeOnVariation"}
+_HARMLESS |= {"OrderEnforcing", "PassiveEnvChecker", "InteractionHistory", "RemakeOnVariation", "RepeatOptions"}
 
 
 def holds_program(model: BaseAlgorithm) -> bool:
@@ -57,6 +59,8 @@ def extract_program(model: BaseAlgorithm, **metadata: Any) -> Program:
         inputs, outputs = (inputs, outputs) if inputs else program_names(env)
         env_id, interaction, wrappers = env_id or env_id_of(env), appends_history(env), wrappers_of(env)
     origin = {"env": env_id, "seed": model.seed, "timesteps": model.num_timesteps}
+    if env_kwargs := _plain(getattr(model, "env_kwargs", {})):
+        origin["env_kwargs"] = env_kwargs
     origin["learned_by"] = getattr(model, "learned_by", LEARNED_BY[0])
     if policy.module.group is not None:
         origin["symmetry"] = policy.module.group.members[0].name
@@ -69,6 +73,14 @@ def extract_program(model: BaseAlgorithm, **metadata: Any) -> Program:
     program = policy.program(tuple(inputs or ()), tuple(outputs or ()), interaction, **{**origin, **metadata})
     normalizer = model.get_vec_normalize_env()
     return program if normalizer is None else _fold(program, normalizer)
+
+
+def _plain(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Return constructor arguments that JSON can hold; none if one is of another kind."""
+    try:
+        return dict(json.loads(json.dumps(dict(env_kwargs), allow_nan=False)))
+    except (TypeError, ValueError):
+        return {}
 
 
 def _fold(program: Program, normalizer: VecNormalize) -> Program:

@@ -102,6 +102,15 @@ def interaction_space(observation_space: spaces.Space[Any], spec: ActionSpec) ->
     )
 
 
+def shaped(actions: NDArray[Any], space: spaces.Space[Any] | None) -> NDArray[Any]:
+    """Return flat actions in the shape that a space has, ``(n_envs, *space.shape)``.
+
+    :param actions: ``(n_envs, n_numbers)`` if Box, else as the space has them
+    :param space: the action space
+    """
+    return actions.reshape(len(actions), *space.shape) if isinstance(space, spaces.Box) else actions
+
+
 def encode_actions(actions: NDArray[Any], spec: ActionSpec, dtype: DTypeLike = np.float32) -> NDArray[Any]:
     """Encode actions for X: one-hot for Discrete and MultiDiscrete, the numbers themselves otherwise.
 

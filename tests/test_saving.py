@@ -17,7 +17,8 @@ from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, Line
 
 from sb3_progpolicy import RecurrentProgrammaticPolicy, ReptilePPO, TaskDistribution
 from sb3_progpolicy.reptile.tasks import Sampler
-from sb3_progpolicy.reptile_ppo.saving import ARGUMENTS, DOCUMENT, TENSORS
+from sb3_progpolicy.reptile_ppo.fields import ARGUMENTS
+from sb3_progpolicy.reptile_ppo.saving import DOCUMENT, TENSORS
 from sb3_progpolicy.reptile_ppo.values import ModelFormatError, from_data, to_data
 from tests.fuzz.models import NAMES, write
 

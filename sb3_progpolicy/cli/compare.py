@@ -70,11 +70,12 @@ def compare(
 
 def _print_table(compared: Any, learned: Sequence[str | None]) -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     first = compared[0].rows
-    shown = "returns" if first[0].success_rate is None else "[share solved]"
-    table = Table(title=f"{first[0].env}, {first[0].episodes} episode(s) each, {shown}")
+    shown = "returns" if first[0].success_rate is None else "steps [share solved]"
+    table = Table(title=escape(f"{first[0].env}, {first[0].episodes} episode(s) each, {shown}"))
     names = list(first[0].variation)
     for name in names:
         table.add_column(name)

@@ -46,4 +46,5 @@ def render(
         if len(variations) != 1:
             raise ValueError(f"--set gives {len(variations)} variations; one episode has one")
         steps, success = record(source, output, variations[0], actor, semantics, seed, fps, max_steps)
-    typer.echo(f"Wrote {output}: {steps} steps, {'goal reached' if success else 'goal not reached'}", err=True)
+    outcome = "" if success is None else ", goal reached" if success else ", goal not reached"
+    typer.echo(f"Wrote {output}: {steps} steps{outcome}", err=True)

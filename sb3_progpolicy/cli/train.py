@@ -36,7 +36,7 @@ def train(
         typer.Option("-params", "--hyperparams", help="overrides: n_steps:64 policy_kwargs:'{depth: 2}'"),
     ] = None,
     env_kwargs: Annotated[
-        list[str] | None, typer.Option("--env-kwargs", help="constructor arguments: n_discs:4")
+        list[str] | None, typer.Option("--env-kwargs", help="constructor arguments: reward_type:sparse")
     ] = None,
     progress: Annotated[bool, typer.Option("-P", "--progress", help="show a progress bar")] = False,
     trained_agent: Annotated[
@@ -55,7 +55,7 @@ def train(
         int, typer.Option("--eval-freq", help="steps between evaluations on the validation variations; negative: none")
     ] = -1,
     eval_episodes: Annotated[int, typer.Option("--eval-episodes", min=1, help="on each variation")] = 5,
-    save_freq: Annotated[int, typer.Option("--save-freq", help="steps between checkpoints; negative: none")] = 50_000,
+    save_freq: Annotated[int, typer.Option("--save-freq", help="steps between checkpoints of our algorithms; negative: none")] = 50_000,
     log_interval: Annotated[int, typer.Option("--log-interval", min=1, help="rollouts between lines of the log")] = 10,
     num_threads: Annotated[int, typer.Option("--num-threads", min=1, help="of torch")] = 1,
     device: Annotated[str, typer.Option("--device", help="cpu, cuda or auto")] = "auto",
@@ -64,7 +64,8 @@ def train(
 ) -> None:
     """Train and write a run folder: the model, its program, what was run with which versions.
 
-    Ctrl-C saves and says how to go on; a killed run goes on from its last checkpoint, to the same result bit for bit.
+    Ctrl-C saves and says how to go on. A killed run of one of our algorithms goes on from its last checkpoint, to the
+    same result bit for bit; stock algorithms keep no checkpoints.
     """
     import torch
 
@@ -83,6 +84,8 @@ def train(
             model, config = run.resume(folder, n_timesteps, max(0, verbose - 1), allow_pickle)
             folders.describe_run(folder, config, arguments)
         else:
+            if trained_agent and init_program:
+                raise ValueError("-i and --init-program are two starts; give one of them")
             config = configs.make_config(
                 algo,
                 env,
@@ -139,6 +142,7 @@ def _say_how_to_go_on(interruption: Any, folder: Path, config: Any, progress: bo
     if not interruption.resumable:
         start = f"progpolicy train --algo {config.algo} --env {shlex.quote(config.env)}"
         again = f"{start} -i {shlex.quote(str(folder))} --allow-pickle{flag}"
+        again += "\n  which trains anew, from its parameters; give the other options again"
     # Not by rich, which would break the command into lines of the terminal's width.
     saved = f"saved at step {interruption.timesteps} in {folder}. To go on:"
     if interruption.reason:

@@ -74,14 +74,17 @@ def draw_comparison(compared: Sequence[Compared]) -> Any:
     figure = Figure(figsize=(11 if has_curves else 6.4, 4), layout="constrained")
     axes = figure.subplots(1, 2 if has_curves else 1, squeeze=False)[0]
     labels = [", ".join(str(value) for value in row.variation.values()) or "as it is" for row in compared[0].rows]
+    has_goal = compared[0].rows[0].success_rate is not None
     for run in compared:
-        axes[0].plot(labels, [row.steps_mean for row in run.rows], marker="o", label=run.name)
+        values = [row.steps_mean if has_goal else row.return_mean for row in run.rows]
+        axes[0].plot(labels, values, marker="o", label=run.name)
     planned = [row.optimal_steps_mean for row in compared[0].rows]
     if all(steps is not None for steps in planned):
         axes[0].plot(labels, planned, color="black", linestyle=":", label="planner")
     axes[0].set_xlabel(", ".join(compared[0].rows[0].variation) or "variation")
-    axes[0].set_ylabel("steps to the goal")
-    axes[0].set_yscale("log")
+    axes[0].set_ylabel("steps to the goal" if has_goal else "return")
+    if has_goal:
+        axes[0].set_yscale("log")
     if has_curves:
         for run in compared:
             axes[1].plot(*(zip(*run.curve, strict=True) if run.curve else ((), ())), marker=".", label=run.name)

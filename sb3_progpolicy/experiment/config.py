@@ -12,6 +12,7 @@ import torch as th
 from gymnasium.envs.registration import load_env_creator
 from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_progpolicy.bounds import BOUNDS, MAX_ROLLOUT, limits_of
 from sb3_progpolicy.env_ids import spec_of
 from sb3_progpolicy.experiment.methods import METHODS, get_method
 from sb3_progpolicy.hyperparams import load_hyperparams, parse_kwargs, parse_number, shortened
@@ -31,8 +32,8 @@ REPTILE = (
     "meta_optimizer",
     "meta_update",
 )
-#: Largest seed, number of environments, and number of transitions in a rollout.
-MAX_SEED, MAX_ENVS, MAX_ROLLOUT = 2**32 - 1, 2**16, 2**28
+#: Largest seed.
+MAX_SEED = 2**32 - 1
 _SCHEDULES = (
     "learning_rate",
     "clip_range",
@@ -42,28 +43,6 @@ _SCHEDULES = (
     "action_std",
     "action_temperature",
 )
-# Bounds, both included, of the numbers that have any; all are finite.
-_POSITIVE = (math.ulp(0.0), math.inf)
-_BOUNDS = {
-    "learning_rate": (0.0, math.inf),
-    "meta_learning_rate": (0.0, math.inf),
-    "temperature": _POSITIVE,
-    "action_temperature": _POSITIVE,
-    "action_std": _POSITIVE,
-    "clip_range": _POSITIVE,
-    "clip_range_vf": _POSITIVE,
-    "max_grad_norm": _POSITIVE,
-    "target_kl": _POSITIVE,
-    "gamma": (0.0, 1.0),
-    "gae_lambda": (0.0, 1.0),
-    "search_fraction": (0.0, 1.0),
-    "vf_coef": (0.0, math.inf),
-    "length_coef": (0.0, math.inf),
-    "n_envs": (1, MAX_ENVS),
-    "n_steps": (1, MAX_ROLLOUT),
-    "n_timesteps": (1, 2**53),
-    "max_episode_steps": (1, 2**53),
-}
 # Arguments of the constructors that have a flag of their own or no place in a file.
 _ELSEWHERE = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
 _ELSEWHERE |= {f"{kind}_buffer_{part}" for kind in ("rollout", "replay") for part in ("class", "kwargs")} | {
@@ -258,13 +237,11 @@ def _checked(name: str, value: Any, default: Any) -> Any:
 
 def _number(name: str, value: Any, accepted: str, bounds: tuple[float, float] = (-math.inf, math.inf)) -> float:
     """Return a finite number within the bounds of its name."""
-    low, high = _BOUNDS.get(name, bounds)
+    low, high = BOUNDS.get(name, bounds)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or value != value or abs(value) == math.inf:
         raise ValueError(f"{name}={shortened(value)} is not accepted; it is {accepted}")
     if not low <= value <= high:
-        limits = (
-            "above 0" if low == math.ulp(0.0) else f"of at least {low:g}" if value < low else f"of at most {high:g}"
-        )
+        limits = limits_of(value, low, high)
         raise ValueError(f"{name}={shortened(value)} is not accepted; it is {accepted} {limits}")
     return value
 

@@ -25,7 +25,7 @@ def record(
     seed: int = 0,
     fps: int | None = None,
     max_steps: int | None = None,
-) -> tuple[int, bool]:
+) -> tuple[int, bool | None]:
     """Play an episode and write it as a film.
 
     :param source: the program, and its environment
@@ -36,12 +36,15 @@ def record(
     :param seed: of the environment
     :param fps: frames per second; the environment's by default
     :param max_steps: cap of the episode; the registered one by default
-    :return: steps, and whether the goal was reached
-    :raises ValueError: if the source has no environment or no program, or the file's name ends otherwise
+    :return: steps, and whether the goal was reached; ``None`` where the environment reports none
+    :raises ValueError: if the source has no environment or no program, the environment does not read what the variation
+        says, or the file's name ends otherwise
     """
     import gymnasium as gym
 
+    from progpolicy_envs import find_domain
     from sb3_progpolicy.env_ids import spec_of
+    from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, unread_names
 
     if output.suffix.lower() not in FORMATS:
         raise ValueError(f"-o {str(output)!r} is not accepted; the file is a .gif or an .mp4")
@@ -49,14 +52,25 @@ def record(
         raise unknown("actor", actor, ACTORS)
     if source.env_id is None:
         raise ValueError(f"{source.name} does not say which environment it is for")
-    cap = max_steps or spec_of(source.env_id).max_episode_steps
+    cap = max_steps or source.env_kwargs.get("max_episode_steps") or spec_of(source.env_id).max_episode_steps
     if cap is None:
         raise ValueError(f"{source.env_id} has no cap on steps; give --max-steps")
-    env = gym.make(source.env_id, render_mode="rgb_array", max_episode_steps=cap, **source.env_kwargs)
+    kwargs = {name: value for name, value in source.env_kwargs.items() if name != "max_episode_steps"}
+    fixed = set() if find_domain(source.env_id) else constructor_arguments(source.env_id, variation, kwargs)
+    kwargs |= {name: variation[name] for name in fixed}
+    env = gym.make(source.env_id, render_mode="rgb_array", max_episode_steps=cap, **kwargs)
     try:
-        observation, info = env.reset(seed=seed, options=dict(variation))
+        options = ReadOptions({name: value for name, value in variation.items() if name not in fixed})
+        observation, info = env.reset(seed=seed, options=options)
+        if unread := unread_names([options]):
+            raise ValueError(
+                f"the reset option {', '.join(sorted(unread))} has no effect; {source.env_id} does not read it"
+            )
         env.action_space.seed(seed)
-        act = _planner(env) if actor == "planner" else _random(env) if actor == "random" else _policy(source, semantics)
+        if actor == "policy":
+            act = _policy(source, semantics, env)
+        else:
+            act = _planner(env) if actor == "planner" else _random(env)
         with FORMATS[output.suffix.lower()](fps or env.metadata.get("render_fps", 4)) as frames:
             steps, success = _play(env, act, observation, info.get("optimal_steps"), cap, frames.add)
             write_atomically(output, frames.content())
@@ -82,18 +96,21 @@ def environment_of(name: str) -> Source:
 Act = Callable[[Any, float, bool], Any]
 
 
-def _policy(source: Source, semantics: Any) -> Act:
+def _policy(source: Source, semantics: Any, env: Any) -> Act:
     if source.program is None:
         raise ValueError(f"{source.name} is not a program; render plays programs, planners and random actions")
+    from sb3_progpolicy.evaluation import refuse_wrappers
     from sb3_progpolicy.programs.interpreter import ProgramRunner, join_inputs
+    from sb3_progpolicy.spaces import shaped
 
+    refuse_wrappers("the program", source.program.metadata.get("wrappers", ()))
     program, previous = source.program, None
     runner = ProgramRunner(program, 1, semantics)
 
     def act(observation: Any, reward: float, done: bool) -> Any:
         nonlocal previous
         previous = runner.act(join_inputs(program, observation, previous, reward, done))
-        return previous[0]
+        return shaped(previous, env.action_space)[0]
 
     return act
 
@@ -114,7 +131,7 @@ def _planner(env: Any) -> Act:
 
 def _play(
     env: Any, act: Act, observation: Any, optimal: int | None, cap: int, show: Callable[[Any], None]
-) -> tuple[int, bool]:
+) -> tuple[int, bool | None]:
     from rich.console import Console
     from rich.progress import Progress
 
@@ -129,7 +146,7 @@ def _play(
             steps += 1
             show(env.render())
             progress.advance(task)
-    return steps, bool(info.get("is_success", False))
+    return steps, bool(info["is_success"]) if "is_success" in info else None
 
 
 class _Gif:

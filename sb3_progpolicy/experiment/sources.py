@@ -101,7 +101,8 @@ def evaluate_source(
     env_id = env_id or source.env_id
     if env_id is None:
         raise ValueError(f"{source.name} does not say which environment it is for; give --env")
-    common: dict[str, Any] = {"env_kwargs": source.env_kwargs, **arguments}
+    own = source.env_kwargs if env_id == source.env_id else {}  # those of another environment are not for this one
+    common: dict[str, Any] = {"env_kwargs": own, **arguments}
     if source.program is None:
         assert source.model is not None
         return evaluate_model(source.model, env_id, variations, n_episodes, **common)
@@ -116,7 +117,7 @@ def _from_program(name: str, program: Program, env_kwargs: dict[str, Any] | None
     env_id = program.metadata.get("env")
     if env_id is not None and not isinstance(env_id, str):
         raise ValueError(f"{name}: metadata: env={env_id!r} is not accepted; it is an environment id")
-    return Source(name, env_id, program, None, env_kwargs or {})
+    return Source(name, env_id, program, None, dict(program.metadata.get("env_kwargs", {}) | (env_kwargs or {})))
 
 
 def _from_run(folder: Path, allow_pickle: bool) -> Source:
@@ -144,8 +145,10 @@ def _from_model(path: Path, allow_pickle: bool) -> Source:
         raise
     except Exception as error:  # unpickling a damaged file may raise anything
         raise ValueError(f"{path} is not a model that can be loaded: {error}") from None
-    env_kwargs = dict(config.env_kwargs) if config else {}
-    env_id = config.env if config else getattr(model, "env_id", None)
+    from sb3_progpolicy.env_ids import id_from_file
+
+    env_kwargs = dict(config.env_kwargs if config else getattr(model, "env_kwargs", {}))
+    env_id = config.env if config else id_from_file(getattr(model, "env_id", None))
     if holds_program(model):
         return _from_program(str(path), extract_program(model, env=env_id), env_kwargs)
     return Source(str(path), env_id, None, model, env_kwargs)

@@ -4,27 +4,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from numbers import Integral
 from pathlib import Path
 from typing import Any
 
+from sb3_progpolicy.bounds import check_whole
 from sb3_progpolicy.imitation.augmentation import STARTS
 from sb3_progpolicy.imitation.recurrent import RECURRENT_CELLS
 
 #: Of the conditions that :func:`~sb3_progpolicy.imitate` makes.
 CELLS = ("affine", "min", *RECURRENT_CELLS)
-
-
-def check_whole(name: str, value: Any, least: int) -> None:
-    """Check a whole number.
-
-    :param name: of the argument
-    :param value: given
-    :param least: that is accepted
-    :raises ValueError: if it is not one, or a smaller one
-    """
-    if isinstance(value, bool) or not isinstance(value, Integral) or int(value) < least:
-        raise ValueError(f"{name}={value!r} is not accepted; it is a whole number of at least {least}")
 
 
 def check_tasks(env_id: Any, tasks: Any) -> None:

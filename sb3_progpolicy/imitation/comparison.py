@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from sb3_progpolicy.bounds import check_whole
 from sb3_progpolicy.imitation.actions import ActionCodec
-from sb3_progpolicy.imitation.arguments import check_tasks, check_whole
+from sb3_progpolicy.imitation.arguments import check_tasks
 from sb3_progpolicy.imitation.rollouts import Pool, ProgramAct, Variations, play
 from sb3_progpolicy.imitation.tasks import training_variations
 from sb3_progpolicy.imitation.teachers import TeacherLike, make_teacher

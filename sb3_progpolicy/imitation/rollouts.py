@@ -17,7 +17,7 @@ from sb3_progpolicy.imitation.teachers import Observations, Situation, Teacher, 
 from sb3_progpolicy.programs.interpreter import ProgramRunner, Semantics
 from sb3_progpolicy.programs.syntax import ProgramData
 from sb3_progpolicy.reptile.options import ReadOptions, unread_names
-from sb3_progpolicy.spaces import action_spec, check_observation_space
+from sb3_progpolicy.spaces import action_spec, check_observation_space, shaped
 
 Act = Callable[[Observations], NDArray[Any]]
 Variations = Sequence[Mapping[str, Any]]
@@ -106,8 +106,7 @@ class Pool:
 
     def step(self, row: int, action: Any) -> tuple[bool, dict[str, Any]]:
         """Take one step; return whether the episode ended, and the infos."""
-        if self.spec.kind == "box":
-            action = np.reshape(action, self.envs[row].action_space.shape)
+        action = shaped(np.asarray(action)[None], self.envs[row].action_space)[0]
         observation, reward, terminated, truncated, info = self.envs[row].step(action)
         self.observations[row], self.rewards[row] = observation, float(reward)
         self.dones[row] = terminated or truncated

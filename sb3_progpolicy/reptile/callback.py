@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
@@ -9,6 +12,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
+from sb3_progpolicy.bounds import check_whole
 from sb3_progpolicy.finite import check_parameters, check_step
 from sb3_progpolicy.reptile.checks import check_variations
 from sb3_progpolicy.reptile.statistics import EpisodeStatistics
@@ -34,7 +38,7 @@ class ReptileWrapper(BaseCallback):
     Logs ``reptile/meta_iteration``, ``reptile/meta_step_norm``, ``reptile/meta_learning_rate`` and, for the variations
     of the current tasks, ``success/<variation>`` and ``steps/<variation>``.
 
-    :param tasks: what to train on
+    :param tasks: what to train on, a :class:`TaskDistribution` or what makes one
     :param inner_updates: k, rollouts (each followed by an update) per task, at least 1
     :param tasks_per_iteration: tasks drawn for a meta-iteration, dealt out over the environments. 1 is algorithm 1 as
         printed; with more, each inner update follows the mean gradient over several tasks, so that it cannot specialise
@@ -51,7 +55,7 @@ class ReptileWrapper(BaseCallback):
 
     def __init__(
         self,
-        tasks: TaskDistribution,
+        tasks: TaskDistribution | Mapping[str, Any] | Sequence[Mapping[str, Any]],
         inner_updates: int = 4,
         tasks_per_iteration: int = 1,
         meta_learning_rate: float | Schedule = 0.5,
@@ -61,7 +65,8 @@ class ReptileWrapper(BaseCallback):
     ) -> None:
         super().__init__(verbose)
         check_reptile_arguments(inner_updates, tasks_per_iteration)
-        self.tasks, self.inner_updates, self.meta_update = tasks, inner_updates, meta_update
+        self.tasks = tasks if isinstance(tasks, TaskDistribution) else TaskDistribution(tasks)
+        self.inner_updates, self.meta_update = inner_updates, meta_update
         self.tasks_per_iteration = tasks_per_iteration
         self.meta_learning_rate = FloatSchedule(meta_learning_rate)
         self.meta_optimizer = MetaOptimizer(meta_optimizer)
@@ -69,7 +74,7 @@ class ReptileWrapper(BaseCallback):
         self.rng = np.random.default_rng()
         self._updates_of_task = 0
         self._task: Task
-        self._statistics = EpisodeStatistics(tasks)
+        self._statistics = EpisodeStatistics(self.tasks)
         self._trained: OnPolicyAlgorithm | None = None
 
     def _init_callback(self) -> None:
@@ -137,11 +142,9 @@ class ReptileWrapper(BaseCallback):
 
 
 def check_reptile_arguments(inner_updates: int, tasks_per_iteration: int) -> None:
-    """Raise ``ValueError`` for a number below 1."""
-    if inner_updates < 1:
-        raise ValueError(f"inner_updates={inner_updates} is not accepted; it is at least 1")
-    if tasks_per_iteration < 1:
-        raise ValueError(f"tasks_per_iteration={tasks_per_iteration} is not accepted; it is at least 1")
+    """Raise ``ValueError`` for what is not a whole number of at least 1."""
+    check_whole("inner_updates", inner_updates, 1)
+    check_whole("tasks_per_iteration", tasks_per_iteration, 1)
 
 
 def start_task(model: OnPolicyAlgorithm, tasks: TaskDistribution, task: Task) -> None:

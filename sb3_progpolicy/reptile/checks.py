@@ -31,6 +31,15 @@ def check_variations(tasks: TaskDistribution, env: VecEnv | None) -> None:
     if env is None or not tasks.check or len(tasks) < 2:
         return
     bare, rng = env.unwrapped, np.random.default_rng(_SEED)
+    try:
+        _compare(tasks, bare, rng)
+    finally:
+        state = np.random.get_state()  # noqa: NPY002 - SB3 draws from it
+        bare.seed(None)  # not the same starts in every training
+        np.random.set_state(state)  # noqa: NPY002
+
+
+def _compare(tasks: TaskDistribution, bare: VecEnv, rng: np.random.Generator) -> None:
     drawn = [
         {name: value(rng) if callable(value) else value for name, value in variation.items()}
         for variation in tasks.variations

@@ -286,10 +286,16 @@ def make_tasks(
     :param env_id: environment id, where it is known
     :param fit: whether it is to have the form that has an effect on this environment, see ``TaskDistribution.fit_to``
     :param env_kwargs: constructor arguments of the environment
+    :raises ValueError: if the tasks set what the constructor's arguments set
     """
     if tasks is None:
         tasks = default_tasks(env_id)
     tasks = tasks if isinstance(tasks, TaskDistribution) else TaskDistribution(tasks)
+    if both := sorted(set(env_kwargs or {}) & set().union(*tasks.variations)):
+        raise ValueError(
+            f"env_kwargs sets {', '.join(both)}, which the tasks set, too: {tasks.variations[0]} is one of them. Give "
+            "tasks the values to train on, such as tasks=[{'n_discs': 6}], and leave them out of env_kwargs"
+        )
     if sampler is not None:
         tasks = tasks.with_sampler(sampler)
     return tasks.fit_to(env_id, env_kwargs) if fit and env_id is not None else tasks

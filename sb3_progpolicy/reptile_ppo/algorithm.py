@@ -17,23 +17,17 @@ from sb3_progpolicy.extraction import env_id_of, extract_program, wrappers_of
 from sb3_progpolicy.interaction import program_names
 from sb3_progpolicy.policies import ProgrammaticActorCritic, ProgrammaticPolicy, RecurrentProgrammaticPolicy
 from sb3_progpolicy.programs.program import LEARNED_BY, Program
-from sb3_progpolicy.reptile.callback import check_reptile_arguments, start_task
+from sb3_progpolicy.reptile.callback import start_task
 from sb3_progpolicy.reptile.checks import check_variations
 from sb3_progpolicy.reptile.samplers import Sampler
 from sb3_progpolicy.reptile.statistics import EpisodeStatistics
 from sb3_progpolicy.reptile.steps import MetaOptimizer, MetaOptimizerName, Task, begin_task
 from sb3_progpolicy.reptile.tasks import TaskDistribution, make_tasks
+from sb3_progpolicy.reptile_ppo.arguments import check_arguments, whole_timesteps
 from sb3_progpolicy.reptile_ppo.environments import make_venv, symmetries_of, with_history, with_limit
-from sb3_progpolicy.reptile_ppo.growth import SearchMethod, begin_growth, check_search_arguments
+from sb3_progpolicy.reptile_ppo.growth import SearchMethod, begin_growth
 from sb3_progpolicy.reptile_ppo.initial import complete_policy_kwargs, read_initial_program, start_from_program
-from sb3_progpolicy.reptile_ppo.inner_loops import (
-    Begun,
-    EngineName,
-    Learning,
-    check_batch_arguments,
-    inner_updates_of_batch,
-    open_inner_loops,
-)
+from sb3_progpolicy.reptile_ppo.inner_loops import Begun, EngineName, Learning, inner_updates_of_batch, open_inner_loops
 from sb3_progpolicy.reptile_ppo.sequence_ppo import Timeouts, default_batch_size
 from sb3_progpolicy.reptile_ppo.stored_ppo import StoredPPO
 from sb3_progpolicy.reptile_ppo.theta import Theta
@@ -185,9 +179,7 @@ class ReptilePPO(StoredPPO):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ) -> None:
-        check_reptile_arguments(inner_updates, tasks_per_iteration)
-        check_batch_arguments(meta_batch_size, engine)
-        check_search_arguments(search_method, search_fraction, growth_iterations)
+        check_arguments(locals())
         self.meta_batch_size, self.engine = meta_batch_size, engine
         self.env_by_id = isinstance(env, str)
         self.env_id = env if isinstance(env, str) else env_id_of(env)
@@ -244,9 +236,9 @@ class ReptilePPO(StoredPPO):
             max_grad_norm=max_grad_norm,
             target_kl=target_kl,
             stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
+            tensorboard_log=None if tensorboard_log is None else str(tensorboard_log),
             policy_kwargs=policy_kwargs,
-            verbose=verbose,
+            verbose=int(verbose),
             seed=seed,
             device=device,
             _init_setup_model=_init_setup_model,
@@ -277,7 +269,7 @@ class ReptilePPO(StoredPPO):
         :param reset_num_timesteps: ``False`` goes on where training stopped
         """
         total_timesteps, callback = self._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+            whole_timesteps(total_timesteps), callback, reset_num_timesteps, tb_log_name, progress_bar
         )
         self._update_current_progress_remaining(self.num_timesteps, max(1, total_timesteps))
         check_variations(self.tasks, self.env)
@@ -413,8 +405,11 @@ class ReptilePPO(StoredPPO):
         :param env: an environment id is accepted too; it is made with the ``env_kwargs`` of this one
         :param force_reset: see SB3's ``BaseAlgorithm.set_env``
         """
-        self.env_by_id = made = isinstance(env, str)
+        made = isinstance(env, str)
         remade = self.tasks.apply == "constructor"
         made_with = with_limit(self.env_kwargs, self.max_episode_steps) if made else {}
         venv = make_venv(env, self.n_envs if made else None, self.seed, made_with, remade)
-        super().set_env(with_history(venv, self.interaction_history), force_reset)
+        venv = with_history(venv, self.interaction_history)
+        super().set_env(venv, force_reset)
+        self.env_by_id, self.env_id = made, env if isinstance(env, str) else env_id_of(venv)
+        self.wrappers, (self.input_names, self.output_names) = wrappers_of(venv), program_names(venv)

@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
+import gymnasium as gym
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, is_vecenv_wrapped, unwrap_vec_wrapper
 
 from progpolicy_envs import find_domain
 from progpolicy_envs.symmetry import Symmetry
@@ -17,6 +18,7 @@ from sb3_progpolicy.interaction import InteractionHistory, VecInteractionHistory
 from sb3_progpolicy.reptile.tasks import RemakeOnVariation
 from sb3_progpolicy.symmetries import as_data
 from sb3_progpolicy.vec_env import make_fast_vec_env
+from sb3_progpolicy.vec_env.repeat import RepeatOptions
 
 DEFAULT_N_ENVS = 32
 
@@ -42,7 +44,12 @@ def make_venv(
         raise ValueError(
             "n_envs, env_kwargs and max_episode_steps are for environment ids; the environment given is already made"
         )
-    return PPO._wrap_env(env)
+    return PPO._wrap_env(RepeatOptions(env) if isinstance(env, gym.Env) and not is_ours(env) else env)
+
+
+def is_ours(env: gym.Env[Any, Any]) -> bool:
+    """Return whether an environment is of one of the domains, which keep a variation until another one is given."""
+    return find_domain(getattr(env.spec, "id", None)) is not None
 
 
 def with_limit(env_kwargs: Mapping[str, Any], max_episode_steps: int | None) -> dict[str, Any]:
@@ -64,12 +71,19 @@ def with_history(venv: VecEnv, interaction_history: bool) -> VecEnv:
 
     :param venv: environments
     :param interaction_history: whether the policy reads it
-    :raises ValueError: if a single environment is wrapped in :class:`InteractionHistory`
+    :raises ValueError: if a single environment is wrapped in :class:`InteractionHistory`, or rewards are scaled
     """
     if interaction_history and any(venv.env_is_wrapped(InteractionHistory)):
         raise ValueError(
             "an environment wrapped in InteractionHistory is not accepted; ReptilePPO appends the history itself. "
             "Give it the environment without the wrapper, or interaction_history=False"
+        )
+    normalizer = unwrap_vec_wrapper(venv, VecNormalize)
+    if interaction_history and normalizer is not None and normalizer.norm_reward:
+        raise ValueError(
+            "VecNormalize with norm_reward=True is not accepted with interaction_history=True: what is learnt would "
+            "read rewards that nothing outside of training scales. Give VecNormalize norm_reward=False; "
+            "scale_rewards=True scales what is learnt from"
         )
     if interaction_history and not is_vecenv_wrapped(venv, VecInteractionHistory):
         return VecInteractionHistory(venv)

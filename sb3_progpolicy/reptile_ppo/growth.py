@@ -17,6 +17,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 import torch as th
 
+from sb3_progpolicy.bounds import check_number, check_whole
 from sb3_progpolicy.differentiable.growth import divide
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.reptile.callback import start_task
@@ -38,12 +39,12 @@ MAX_ROUNDS = 3
 
 def check_search_arguments(search_method: str, search_fraction: float, growth_iterations: int) -> None:
     """Raise ``ValueError`` for a value that is not accepted."""
-    if not 0 <= search_fraction <= 1:
-        raise ValueError(f"search_fraction={search_fraction} is not accepted; it is from 0 to 1")
+    check_number("search_fraction", search_fraction)
     if search_method not in get_args(SearchMethod):
         raise unknown("search_method", search_method, get_args(SearchMethod))
-    if growth_iterations < 1:
-        raise ValueError(f"growth_iterations={growth_iterations} is not accepted; it is at least 1")
+    check_whole("growth_iterations", growth_iterations, 1)
+    if search_method == "growth" and search_fraction == 0:
+        raise ValueError("search_fraction=0 is not accepted with search_method='growth': nothing would be tried")
 
 
 def begin_growth(model: Any) -> Growth:

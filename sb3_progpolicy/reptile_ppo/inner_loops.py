@@ -24,6 +24,7 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
+from sb3_progpolicy.bounds import check_whole
 from sb3_progpolicy.cluster import join_cluster
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.reptile.steps import Task
@@ -52,8 +53,7 @@ class Learning:
 
 def check_batch_arguments(meta_batch_size: int, engine: str) -> None:
     """Raise ``ValueError`` for a value that is not accepted or has no effect."""
-    if meta_batch_size < 1:
-        raise ValueError(f"meta_batch_size={meta_batch_size} is not accepted; it is at least 1")
+    check_whole("meta_batch_size", meta_batch_size, 1)
     if engine not in get_args(EngineName):
         raise unknown("engine", engine, get_args(EngineName))
     if engine != "local" and meta_batch_size == 1:

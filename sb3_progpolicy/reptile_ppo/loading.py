@@ -18,16 +18,16 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces
 
+from sb3_progpolicy.bounds import MAX_ENVS, MAX_ROLLOUT
 from sb3_progpolicy.reptile.samplers import SAMPLERS
 from sb3_progpolicy.reptile.steps import META_OPTIMIZERS
 from sb3_progpolicy.reptile.tasks import TaskDistribution
 from sb3_progpolicy.reptile_ppo.environments import make_venv, with_history
+from sb3_progpolicy.reptile_ppo.fields import ARGUMENTS, STATE
 from sb3_progpolicy.reptile_ppo.saving import (
-    ARGUMENTS,
     ARM,
     OPTIMIZERS,
     ROLLOUT,
-    STATE,
     SavedModel,
     is_sb3_file,
     read_model,
@@ -46,7 +46,7 @@ FIXED = (
 _NOT_STORED = ("n_envs", "sampler")
 #: Tensors of a policy that came later: files without them mean what a new policy has.
 _LATER = ("module.action_temperature",)
-MAX_ENVS, MAX_ROLLOUT, MAX_PARAMETERS = 2**16, 2**28, 10**7
+MAX_PARAMETERS = 10**7
 # What constructors raise for values of the right type that they cannot take.
 _REFUSALS = (TypeError, AttributeError, AssertionError, ArithmeticError, LookupError, RuntimeError, MemoryError)
 
@@ -136,7 +136,9 @@ def _check_sizes(saved: SavedModel) -> None:
     if (size := arguments.get("n_steps", 1) * state["n_envs"] * (sum(flat) + 6)) > MAX_ROLLOUT:
         raise ModelFormatError(f"a rollout of {size} numbers is not accepted; at most {MAX_ROLLOUT}")
     # No policy has more parameters than layers times their two largest sizes.
-    sizes = sorted([*flat, *_whole_numbers(arguments.get("policy_kwargs"))])
+    policy_kwargs = arguments.get("policy_kwargs") or {}
+    shape = {name: value for name, value in policy_kwargs.items() if name not in ("symmetries", "optimizer_kwargs")}
+    sizes = sorted([*flat, *_whole_numbers(shape)])
     held = sum(tensor.size for tensor in saved.under("policy").values())
     if len(sizes) * sizes[-1] * sizes[-2] > max(MAX_PARAMETERS, 8 * held):
         raise ModelFormatError(f"layers of up to {sizes[-1]} units are not accepted; the file has {held} parameters")
@@ -174,6 +176,11 @@ def _make(
         model.n_envs, model.env_id = changes.get("n_envs", state["n_envs"]), state.get("env_id")
     else:
         assert model.env is not None
+        if "VecNormalize" in state.get("wrappers", ()) and model.get_vec_normalize_env() is None:
+            raise ValueError(
+                "env is not accepted without VecNormalize: the model was trained with it, and the file does not hold "
+                "its statistics. Give VecNormalize.load(file, env), with the file that VecNormalize.save has written"
+            )
         check_for_correct_spaces(model.env, state["observation_space"], state["action_space"])
     model._setup_model()
     return model

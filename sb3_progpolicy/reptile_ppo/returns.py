@@ -16,6 +16,7 @@ from sb3_progpolicy.programs.interpreter import ProgramRunner
 from sb3_progpolicy.reptile.callback import start_task
 from sb3_progpolicy.reptile.steps import Task
 from sb3_progpolicy.reptile_ppo.inner_loops import Learning
+from sb3_progpolicy.spaces import shaped
 
 #: Least number of episodes of a program.
 MIN_EPISODES = 64
@@ -43,7 +44,7 @@ def episode_returns(model: Any, task: Task, learning: Learning) -> NDArray[np.fl
     runner = ProgramRunner(model.policy.program(), n_envs)
     cap, step = n_rounds * _max_steps(env), 0
     while number.min() < n_rounds and step < cap and not learning.stopped:
-        new_obs, rewards, dones, infos = env.step(runner.act(model._last_obs))
+        new_obs, rewards, dones, infos = env.step(shaped(runner.act(model._last_obs), env.action_space))
         model._last_obs, step = new_obs, step + 1
         running += rewards
         ended = np.flatnonzero(dones & (number < n_rounds))

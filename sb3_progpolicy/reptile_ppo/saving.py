@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import io
 import json
-import math
 import os
 import zipfile
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,14 +20,13 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 import torch as th
-from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule, get_system_info
+from stable_baselines3.common.utils import get_system_info
 
 from sb3_progpolicy.programs.files import write_atomically
-from sb3_progpolicy.programs.program import LEARNED_BY
 from sb3_progpolicy.reptile.samplers import SAMPLERS
 from sb3_progpolicy.reptile.tasks import TaskDistribution
+from sb3_progpolicy.reptile_ppo.fields import ARGUMENTS, STATE
 from sb3_progpolicy.reptile_ppo.values import ModelFormatError, NotDataError, from_data, to_data
 
 FORMAT, VERSION = "sb3-progpolicy model", 1
@@ -36,111 +34,9 @@ DOCUMENT, TENSORS = "model.json", "tensors.safetensors"
 MAX_BYTES = {DOCUMENT: 2**24, TENSORS: 2**31}
 MAX_CONTAINERS = 10**5
 
-Check = Callable[[Any], bool]
 Tensors = dict[str, NDArray[Any]]
 
 
-def _number(value: Any) -> bool:
-    return type(value) in (int, float) and math.isfinite(value)
-
-
-def _count(value: Any) -> bool:
-    return type(value) is int and 0 <= value < 2**53
-
-
-def _flag(value: Any) -> bool:
-    return type(value) is bool
-
-
-def _text(value: Any) -> bool:
-    return type(value) is str
-
-
-def _schedule(value: Any) -> bool:
-    return _number(value) or type(value) in (LinearSchedule, ConstantSchedule, FloatSchedule)
-
-
-def _mapping(value: Any) -> bool:
-    return type(value) is dict
-
-
-def _space(value: Any) -> bool:
-    return isinstance(value, spaces.Space)
-
-
-def _optional(check: Check) -> Check:
-    return lambda value: value is None or check(value)
-
-
-def _all(check: Check) -> Check:
-    return lambda value: isinstance(value, (list, tuple)) and all(check(item) for item in value)
-
-
-#: The constructor's arguments, and what a file may give for them.
-ARGUMENTS: Mapping[str, Check] = {
-    "policy": _text,
-    "learning_rate": _schedule,
-    "n_steps": _count,
-    "batch_size": _count,
-    "n_epochs": _count,
-    "gamma": _number,
-    "gae_lambda": _number,
-    "clip_range": _schedule,
-    "clip_range_vf": _optional(_schedule),
-    "normalize_advantage": _flag,
-    "ent_coef": _number,
-    "vf_coef": _number,
-    "max_grad_norm": _number,
-    "target_kl": _optional(_number),
-    "tasks": _mapping,
-    "env_kwargs": _mapping,
-    "max_episode_steps": _optional(_count),
-    "inner_updates": _count,
-    "tasks_per_iteration": _count,
-    "meta_batch_size": _count,
-    "engine": _text,
-    "meta_learning_rate": _schedule,
-    "meta_optimizer": _text,
-    "meta_update": _flag,
-    "search_method": _text,
-    "search_fraction": _number,
-    "growth_iterations": _count,
-    "length_coef": _number,
-    "temperature": _optional(_schedule),
-    "action_temperature": _optional(_schedule),
-    "action_std": _optional(_schedule),
-    "symmetric": _flag,
-    "interaction_history": _flag,
-    "normalize_observations": _flag,
-    "scale_rewards": _flag,
-    "timeouts": _text,
-    "stats_window_size": _count,
-    "tensorboard_log": _optional(_text),
-    "policy_kwargs": _mapping,
-    "verbose": _count,
-    "seed": _optional(_count),
-}
-#: The state of a training besides tensors, and what a file may give for it.
-STATE: Mapping[str, Check] = {
-    "env_id": _optional(_text),
-    "n_envs": _count,
-    "observation_space": _space,
-    "action_space": _space,
-    "input_names": _optional(_all(_text)),
-    "output_names": _optional(_all(_text)),
-    "wrappers": _all(_text),
-    "learned_by": lambda value: value in LEARNED_BY,
-    "num_timesteps": _count,
-    "total_timesteps": _count,
-    "progress_remaining": _number,
-    "n_updates": _count,
-    "meta_iteration": _count,
-    "rng": _mapping,
-    "reward_statistics": _optional(_all(_number)),
-    "episodes": _optional(_all(_all(_number))),
-    "growth": _optional(_mapping),
-    "successes": _optional(_all(lambda value: _flag(value) or _number(value))),
-}
 OPTIMIZERS = ("policy.optimizer", "outer_optimizer")
 #: Before the names of what belongs to the program that growth is trying.
 ARM = "growth/"
@@ -194,13 +90,15 @@ def write_model(
     }
     entries: dict[str, bytes] = {}
     refused = []
-    for part, values in (("arguments", _arguments(model)), ("state", _state(model))):
+    for part, values, checks in (("arguments", _arguments(model), ARGUMENTS), ("state", _state(model), STATE)):
         document[part] = {}
         for name, value in values.items():
             if name in left_out:
                 continue
             try:
                 document[part][name] = to_data(value)
+                if not checks[name](from_data(document[part][name])):
+                    raise ValueError(f"the model is not saved: {name}={value!r:.60} would not be accepted on loading")
             except NotDataError as error:
                 refused.append(f"{name}: {error}")
                 if allow_pickle:
@@ -268,7 +166,7 @@ def _state(model: Any) -> dict[str, Any]:
         "action_space": model.action_space,
         "input_names": model.input_names,
         "output_names": model.output_names,
-        "wrappers": model.wrappers,
+        "wrappers": _wrappers(model),
         "learned_by": model.learned_by,
         "num_timesteps": model.num_timesteps,
         "total_timesteps": model._total_timesteps,
@@ -281,6 +179,12 @@ def _state(model: Any) -> dict[str, Any]:
         "episodes": None if episodes is None else [[episode[key] for key in "rlt"] for episode in episodes],
         "successes": None if successes is None else list(successes),
     }
+
+
+def _wrappers(model: Any) -> tuple[str, ...]:
+    """The wrappers that an id does not bring back, with VecNormalize, whose statistics are not in the file."""
+    normalized = () if model.get_vec_normalize_env() is None else ("VecNormalize",)
+    return tuple(dict.fromkeys((*model.wrappers, *normalized)))
 
 
 def _tensors(model: Any, parameters: Mapping[str, Any]) -> Tensors:

@@ -161,5 +161,5 @@ _MAKE: Mapping[str, Any] = {
     "box": _box,
     "discrete": lambda n, start: spaces.Discrete(n, start=start),
     "multi_discrete": lambda nvec, start: spaces.MultiDiscrete(nvec, start=start),
-    "multi_binary": lambda shape: spaces.MultiBinary(shape),
+    "multi_binary": lambda shape: spaces.MultiBinary(shape[0] if len(shape) == 1 else shape),
 }
