@@ -27,6 +27,7 @@ from sb3_progpolicy import (
 )
 from sb3_progpolicy.experiment.config import make_config
 from sb3_progpolicy.experiment.run import build_model
+from sb3_progpolicy.interaction import VecInteractionHistory
 from sb3_progpolicy.programs import ProgramRunner
 
 SMALL = {"n_steps": 16, "batch_size": 32, "n_epochs": 2, "seed": 0, "device": "cpu"}
@@ -302,9 +303,11 @@ def test_statistics_of_vec_normalize_are_folded_into_the_program(algorithm, norm
 
 def test_program_that_reads_scaled_rewards_is_refused():
     venv = VecNormalize(make_vec_env("Pendulum-v1", 4, seed=0))
-    model = ReptilePPO("ProgPolicy", venv, **SMALL).learn(64)
     with pytest.raises(ValueError, match="scale_rewards=True"):
-        model.program()
+        ReptilePPO("ProgPolicy", venv, **SMALL)
+    model = PPO(ProgrammaticPolicy, VecInteractionHistory(venv), **SMALL).learn(64)
+    with pytest.raises(ValueError, match="scale_rewards=True"):
+        extract_program(model)
 
 
 def test_model_is_evaluated_with_the_statistics_of_its_environment():

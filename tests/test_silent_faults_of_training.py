@@ -121,8 +121,6 @@ def test_arguments_that_the_command_line_refuses_are_refused_here_too():
     for name, value in wrong.items():
         with pytest.raises(ValueError, match=name):
             ReptilePPO("ProgPolicy", "CartPole-v1", **{name: value})
-    with pytest.raises(ValueError, match="nothing would be tried"):
-        ReptilePPO("ProgPolicy", "CartPole-v1", search_method="growth", search_fraction=0.0)
     with pytest.raises(ValueError, match=r"inner_updates=1\.5 is not accepted"):
         ReptileWrapper({"n_discs": [1, 2]}, inner_updates=1.5)
     assert len(ReptileWrapper({"n_discs": [1, 2]}).tasks) == 2

@@ -55,7 +55,9 @@ def train(
         int, typer.Option("--eval-freq", help="steps between evaluations on the validation variations; negative: none")
     ] = -1,
     eval_episodes: Annotated[int, typer.Option("--eval-episodes", min=1, help="on each variation")] = 5,
-    save_freq: Annotated[int, typer.Option("--save-freq", help="steps between checkpoints of our algorithms; negative: none")] = 50_000,
+    save_freq: Annotated[
+        int, typer.Option("--save-freq", help="steps between checkpoints of our algorithms; negative: none")
+    ] = 50_000,
     log_interval: Annotated[int, typer.Option("--log-interval", min=1, help="rollouts between lines of the log")] = 10,
     num_threads: Annotated[int, typer.Option("--num-threads", min=1, help="of torch")] = 1,
     device: Annotated[str, typer.Option("--device", help="cpu, cuda or auto")] = "auto",

@@ -43,8 +43,6 @@ def check_search_arguments(search_method: str, search_fraction: float, growth_it
     if search_method not in get_args(SearchMethod):
         raise unknown("search_method", search_method, get_args(SearchMethod))
     check_whole("growth_iterations", growth_iterations, 1)
-    if search_method == "growth" and search_fraction == 0:
-        raise ValueError("search_fraction=0 is not accepted with search_method='growth': nothing would be tried")
 
 
 def begin_growth(model: Any) -> Growth:

@@ -68,7 +68,7 @@ def test_tasks_are_given_as_mapping_or_list(tasks):
         ({"timeouts": "failure"}, "known: bootstrap, terminal"),
         ({"env": "FrozenLake-v1"}, "FlattenObservation"),
         ({"policy_kwargs": {"cell": "mamba"}}, "known cells"),
-        ({"env_kwargs": {"n_discs": 99}}, "n_discs=99"),
+        ({"env_kwargs": {"n_discs": 99}}, "which the tasks set, too"),
     ],
 )
 def test_values_that_are_not_accepted_are_named(arguments, message):

@@ -398,8 +398,8 @@ def test_gradient_search_says_nothing_of_growth():
     ("ProgPolicy", {"policy_kwargs": {"n_conditions": 2}}, "n_conditions=2"),
     ("ProgPolicy", {"policy_kwargs": {"depth": 1}}, "depth=1"),
     ("ProgPolicy", {"search_method": "grow"}, "unknown search_method 'grow'; nearest: growth"),
-    ("ProgPolicy", {"growth_iterations": 0}, "growth_iterations=0 is not accepted; it is at least 1"),
-    ("ProgPolicy", {"search_fraction": 1.5}, "search_fraction=1.5 is not accepted; it is from 0 to 1"),
+    ("ProgPolicy", {"growth_iterations": 0}, "growth_iterations=0 is not accepted; it is a whole number of at least 1"),
+    ("ProgPolicy", {"search_fraction": 1.5}, "search_fraction=1.5 is not accepted; it is a number of at most 1"),
 ])  # fmt: skip
 def test_what_cannot_grow_is_refused(policy, arguments, message):
     with pytest.raises(ValueError, match=message):

@@ -142,7 +142,7 @@ def test_more_tasks_are_learnt_from_at_once():
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    ({"meta_batch_size": 0}, "meta_batch_size=0 is not accepted; it is at least 1"),
+    ({"meta_batch_size": 0}, "meta_batch_size=0 is not accepted; it is a whole number of at least 1"),
     ({"engine": "thread"}, "engine.*thread.*serial, local, ray"),
     ({"engine": "ray", "meta_batch_size": 1}, "has no effect with meta_batch_size=1"),
 ])  # fmt: skip
