@@ -318,6 +318,8 @@ class _EvaluateVariations(BaseCallback):
             self.logger.record("eval/success_rate", success)
             self.logger.record("eval/steps_mean", steps)
         self.logger.record("eval/return_mean", sum(row.return_mean for row in rows) / len(rows))
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)  # as SB3's EvalCallback does
 
     def _on_step(self) -> bool:
         return True

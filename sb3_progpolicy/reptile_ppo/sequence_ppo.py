@@ -123,6 +123,8 @@ class SequencePPO(PPO):
                 f"{self.batch_size // self.sequence_length} sequences of {self.sequence_length} steps",
                 stacklevel=2,
             )
+        if self.temperature is not None and self.search is None:
+            raise ValueError(f"temperature is for programs, not {type(self.policy).__name__}; it is of their conditions")
         if self.action_temperature is not None and (self.search is None or hasattr(self.policy, "log_std")):
             raise ValueError(f"action_temperature is for programs with discrete actions, not {self.action_space}")
         if self.action_std is not None and not hasattr(self.policy, "log_std"):
