@@ -121,7 +121,7 @@ def test_arguments_that_the_command_line_refuses_are_refused_here_too():
     for name, value in wrong.items():
         with pytest.raises(ValueError, match=name):
             ReptilePPO("ProgPolicy", "CartPole-v1", **{name: value})
-    with pytest.raises(ValueError, match="temperature is for programs, not ActorCriticPolicy"):
+    with pytest.raises(ValueError, match="temperature is for the conditions of programs, not for Act"):
         ReptilePPO("MlpPolicy", "CartPole-v1", temperature=0.5)
     with pytest.raises(ValueError, match=r"inner_updates=1\.5 is not accepted"):
         ReptileWrapper({"n_discs": [1, 2]}, inner_updates=1.5)

@@ -124,7 +124,7 @@ class SequencePPO(PPO):
                 stacklevel=2,
             )
         if self.temperature is not None and self.search is None:
-            raise ValueError(f"temperature is for programs, not {type(self.policy).__name__}; it is of their conditions")
+            raise ValueError(f"temperature is for the conditions of programs, not for {type(self.policy).__name__}")
         if self.action_temperature is not None and (self.search is None or hasattr(self.policy, "log_std")):
             raise ValueError(f"action_temperature is for programs with discrete actions, not {self.action_space}")
         if self.action_std is not None and not hasattr(self.policy, "log_std"):
