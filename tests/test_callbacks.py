@@ -103,7 +103,7 @@ def test_a_history_that_is_there_is_not_appended_again(given):
 
 def test_statistics_of_vec_normalize_are_taken_over():
     training, evaluation = (VecNormalize(DummyVecEnv([cartpole]), training=t) for t in (True, False))
-    model = make(training)
+    model = make(training, "MlpPolicy")
     model.learn(32, callback=InteractionEvalCallback(evaluation, n_eval_episodes=1, eval_freq=32, verbose=0))
     np.testing.assert_array_equal(evaluation.obs_rms.mean, training.obs_rms.mean)
     assert evaluation.obs_rms.mean.any()

@@ -175,7 +175,7 @@ def test_normalised_model_is_not_another_one_after_loading(tmp_path):
     def normalised(**arguments):
         return VecNormalize(DummyVecEnv([lambda: gym.make("CartPole-v1")]), **arguments)
 
-    with pytest.raises(ValueError, match="norm_reward=True is not accepted with interaction_history=True"):
+    with pytest.raises(ValueError, match="norm_reward=True is not accepted for a program"):
         ReptilePPO("ProgPolicy", normalised(), **SMALL)
     venv = normalised(norm_reward=False)
     model = ReptilePPO("ProgPolicy", venv, normalize_observations=False, **SMALL).learn(64)

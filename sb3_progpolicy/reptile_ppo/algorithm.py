@@ -187,12 +187,12 @@ class ReptilePPO(StoredPPO):
         self.env_kwargs, self.max_episode_steps = dict(env_kwargs or {}), max_episode_steps
         made_with = with_limit(self.env_kwargs, max_episode_steps)
         self.tasks = make_tasks(tasks, sampler, self.env_id, self.env_by_id, env_kwargs)
+        policy_class = self._get_policy_from_name(policy) if isinstance(policy, str) else policy
+        learns_program = issubclass(policy_class, ProgrammaticActorCritic)
         venv = None
         if env is not None:
             remade = self.tasks.apply == "constructor"
-            venv = with_history(make_venv(env, n_envs, seed, made_with, remade), interaction_history)
-        policy_class = self._get_policy_from_name(policy) if isinstance(policy, str) else policy
-        learns_program = issubclass(policy_class, ProgrammaticActorCritic)
+            venv = with_history(make_venv(env, n_envs, seed, made_with, remade), interaction_history, learns_program)
         if batch_size is None:
             batch_size = default_batch_size(n_steps, 1 if venv is None else venv.num_envs, learns_program)
         if learning_rate is None:
@@ -409,7 +409,7 @@ class ReptilePPO(StoredPPO):
         remade = self.tasks.apply == "constructor"
         made_with = with_limit(self.env_kwargs, self.max_episode_steps) if made else {}
         venv = make_venv(env, self.n_envs if made else None, self.seed, made_with, remade)
-        venv = with_history(venv, self.interaction_history)
+        venv = with_history(venv, self.interaction_history, isinstance(self.policy, ProgrammaticActorCritic))
         super().set_env(venv, force_reset)
         self.env_by_id, self.env_id = made, env if isinstance(env, str) else env_id_of(venv)
         self.wrappers, (self.input_names, self.output_names) = wrappers_of(venv), program_names(venv)

@@ -66,11 +66,12 @@ def with_limit(env_kwargs: Mapping[str, Any], max_episode_steps: int | None) -> 
     return {**env_kwargs, "max_episode_steps": max_episode_steps}
 
 
-def with_history(venv: VecEnv, interaction_history: bool) -> VecEnv:
+def with_history(venv: VecEnv, interaction_history: bool, learns_program: bool = False) -> VecEnv:
     """Append the interaction history, if asked for and not there yet.
 
     :param venv: environments
     :param interaction_history: whether the policy reads it
+    :param learns_program: whether the policy is a program, which is run where nothing scales rewards
     :raises ValueError: if a single environment is wrapped in :class:`InteractionHistory`, or rewards are scaled
     """
     if interaction_history and any(venv.env_is_wrapped(InteractionHistory)):
@@ -79,11 +80,11 @@ def with_history(venv: VecEnv, interaction_history: bool) -> VecEnv:
             "Give it the environment without the wrapper, or interaction_history=False"
         )
     normalizer = unwrap_vec_wrapper(venv, VecNormalize)
-    if interaction_history and normalizer is not None and normalizer.norm_reward:
+    if interaction_history and learns_program and normalizer is not None and normalizer.norm_reward:
         raise ValueError(
-            "VecNormalize with norm_reward=True is not accepted with interaction_history=True: what is learnt would "
-            "read rewards that nothing outside of training scales. Give VecNormalize norm_reward=False; "
-            "scale_rewards=True scales what is learnt from"
+            "VecNormalize with norm_reward=True is not accepted for a program that reads its previous reward: nothing "
+            "outside of training scales it. Give VecNormalize norm_reward=False; scale_rewards=True scales what is "
+            "learnt from"
         )
     if interaction_history and not is_vecenv_wrapped(venv, VecInteractionHistory):
         return VecInteractionHistory(venv)
