@@ -23,6 +23,7 @@ from sb3_progpolicy.programs.syntax import ProgramData
 from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, unread_names
 from sb3_progpolicy.spaces import action_spec, interaction_space, shaped
 from sb3_progpolicy.vec_env import BatchedVecEnv, make_fast_vec_env
+from sb3_progpolicy.vec_env.repeat import repeat_options
 
 Act = Callable[[NDArray[Any], NDArray[np.float32], NDArray[np.bool_]], NDArray[Any]]
 
@@ -351,6 +352,8 @@ def _play(
     optimal = np.full((n_envs, n_episodes), np.nan)
     venv.seed(seed)
     given = [ReadOptions(variation) for variation in variations]
+    if any(variations):
+        repeat_options(venv)
     venv.set_options(list(given))
     observations: Any = venv.reset()
     if unread := unread_names(given):

@@ -4,8 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_progpolicy import ReptilePPO, ReptileWrapper, evaluate_model, evaluate_program
@@ -14,7 +14,7 @@ from sb3_progpolicy.experiment.sources import find_source
 from sb3_progpolicy.reptile_ppo.loading import _check_sizes
 from sb3_progpolicy.reptile_ppo.saving import SavedModel
 from sb3_progpolicy.vec_env import make_fast_vec_env
-from sb3_progpolicy.vec_env.repeat import RepeatOptions
+from sb3_progpolicy.vec_env.repeat import RepeatOptions, repeat_options
 
 SMALL = {"n_steps": 8, "batch_size": 8, "n_epochs": 1, "seed": 0, "device": "cpu"}
 
@@ -50,7 +50,7 @@ def sized():
     gym.registry.pop("Sized-v0")
 
 
-def test_options_are_in_force_in_every_episode():
+def test_options_are_in_force_in_every_episode(tmp_path):
     model = ReptilePPO("ProgPolicy", "Sized-v0", tasks={"size": [0.5, 5.0]}, n_envs=2, **SMALL)
     seen = []
     reset = Sized.reset
@@ -67,20 +67,30 @@ def test_options_are_in_force_in_every_episode():
     assert len(seen) > 40
     (row,) = evaluate_program(model.program(), "Sized-v0", [{"size": 5.0}], 6)
     assert row.return_mean == 15
-    single = ReptilePPO("ProgPolicy", Sized(), tasks={"size": [0.5, 5.0]}, **SMALL)
-    assert single.env.env_is_wrapped(RepeatOptions) == [True]
-    assert single.wrappers == ()
+    seen.clear()
+    stock = PPO("MlpPolicy", DummyVecEnv([Sized]), **SMALL)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Sized, "reset", spy)
+        stock.learn(100, callback=ReptileWrapper({"size": [0.5, 5.0]}))
+    assert set(seen[1:]) == {0.5, 5.0}
+    model.save(tmp_path / "model.zip")
+    assert ReptilePPO.load(tmp_path / "model.zip").wrappers == ()
 
 
 def test_options_that_are_given_replace_those_before():
     venv = make_fast_vec_env("Sized-v0", 1)
+    repeat_options(venv)
+    repeat_options(venv)
     for size in (2.0, 3.0):
         venv.set_options({"size": size})
         assert venv.reset()[0, 0] == size
         for _ in range(4):
             observations, *_ = venv.step(np.zeros(1, int))
         assert observations[0, 0] == size
-    assert not any(make_fast_vec_env("Hanoi-v0", 1).env_is_wrapped(RepeatOptions))
+    assert not isinstance(venv.unwrapped.envs[0].env, RepeatOptions)  # once only
+    ours = make_vec_env("Hanoi-v0", 1)
+    repeat_options(ours)
+    assert not any(ours.env_is_wrapped(RepeatOptions))
 
 
 def test_constructor_arguments_that_tasks_set_too_are_refused():
@@ -264,9 +274,3 @@ def test_two_starts_of_a_training_are_refused(capsys):
 def test_legend_of_a_comparison_is_shown(capsys):
     assert run(["compare", "Hanoi-v0", "Hanoi-v0", "--set", "n_discs=1", "--episodes", "1"]) == 0
     assert "[share solved]" in capsys.readouterr().out
-
-
-def test_user_made_vec_envs_stay_as_they_are():
-    venv = make_vec_env("CartPole-v1", 2)
-    model = ReptilePPO("ProgPolicy", venv, meta_learning_rate=LinearSchedule(1.0, 0.5, 1.0), **SMALL)
-    assert not any(model.env.env_is_wrapped(RepeatOptions))

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from progpolicy_envs import find_domain
 from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, unread_names
 from sb3_progpolicy.reptile.samplers import CurriculumSampler, FailureSampler, Sampler, UniformSampler, make_sampler
+from sb3_progpolicy.vec_env.repeat import repeat_options
 
 __all__ = ["RemakeOnVariation", "TaskDistribution", "Variation", "default_tasks", "make_tasks"]
 __all__ += ["CurriculumSampler", "FailureSampler", "Sampler", "UniformSampler"]  # models of release 0.1 look here
@@ -226,6 +227,8 @@ class TaskDistribution:
         :raises ValueError: if the environments cannot be varied in this way
         """
         if self.apply == "options":
+            if any(variations):
+                repeat_options(env)
             env.set_options([ReadOptions(variation) for variation in variations])
             return
         for row, variation in enumerate(variations):

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
-import gymnasium as gym
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import GymEnv
@@ -18,7 +17,6 @@ from sb3_progpolicy.interaction import InteractionHistory, VecInteractionHistory
 from sb3_progpolicy.reptile.tasks import RemakeOnVariation
 from sb3_progpolicy.symmetries import as_data
 from sb3_progpolicy.vec_env import make_fast_vec_env
-from sb3_progpolicy.vec_env.repeat import RepeatOptions
 
 DEFAULT_N_ENVS = 32
 
@@ -44,12 +42,7 @@ def make_venv(
         raise ValueError(
             "n_envs, env_kwargs and max_episode_steps are for environment ids; the environment given is already made"
         )
-    return PPO._wrap_env(RepeatOptions(env) if isinstance(env, gym.Env) and not is_ours(env) else env)
-
-
-def is_ours(env: gym.Env[Any, Any]) -> bool:
-    """Return whether an environment is of one of the domains, which keep a variation until another one is given."""
-    return find_domain(getattr(env.spec, "id", None)) is not None
+    return PPO._wrap_env(env)
 
 
 def with_limit(env_kwargs: Mapping[str, Any], max_episode_steps: int | None) -> dict[str, Any]:

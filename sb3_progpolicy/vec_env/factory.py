@@ -17,7 +17,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 from progpolicy_envs import find_domain
 from sb3_progpolicy.vec_env.batched import BatchedVecEnv
 from sb3_progpolicy.vec_env.grouped import GroupedSubprocVecEnv, GroupedVecEnv, even_shares, usable_cores
-from sb3_progpolicy.vec_env.repeat import RepeatOptions
 
 _IN_THIS_PROCESS: ContextVar[bool] = ContextVar("in_this_process", default=False)
 
@@ -71,10 +70,7 @@ def make_fast_vec_env(env_id: str, n_envs: int, seed: int | None = None, **env_k
         return VecMonitor(venv)
     # SB3 names its own two classes here and takes any other.
     vec_env_cls: Any = GroupedSubprocVecEnv if n_processes > 1 else DummyVecEnv
-    repeated = None if domain is not None else RepeatOptions  # ours keep them by themselves
-    return make_vec_env(
-        env_id, n_envs=n_envs, seed=seed, env_kwargs=env_kwargs, vec_env_cls=vec_env_cls, wrapper_class=repeated
-    )
+    return make_vec_env(env_id, n_envs=n_envs, seed=seed, env_kwargs=env_kwargs, vec_env_cls=vec_env_cls)
 
 
 def _batch_suffices(simulation: bool, env_kwargs: Mapping[str, Any]) -> bool:

@@ -5,6 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium as gym
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from progpolicy_envs import find_domain
 
 
 class RepeatOptions(gym.Wrapper[Any, Any, Any, Any]):
@@ -22,3 +25,19 @@ class RepeatOptions(gym.Wrapper[Any, Any, Any, Any]):
         if options is not None:
             self._options = options
         return self.env.reset(seed=seed, options=self._options)
+
+
+def repeat_options(venv: VecEnv) -> None:
+    """Wrap environments that are stepped one by one in :class:`RepeatOptions`, unless they are of a domain or wrapped.
+
+    The domains' keep a variation in force by themselves. Those in other processes or of one batch cannot be wrapped
+    from here.
+
+    :param venv: environments, whose ``envs`` are replaced
+    """
+    bare: Any = venv.unwrapped
+    if not isinstance(bare, DummyVecEnv):
+        return
+    for row, env in enumerate(bare.envs):
+        if not isinstance(env, RepeatOptions) and find_domain(getattr(env.spec, "id", None)) is None:
+            bare.envs[row] = RepeatOptions(env)
