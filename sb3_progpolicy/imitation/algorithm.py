@@ -73,8 +73,8 @@ def imitate(
     :param plain_tolerance: share of the score that a plain program may cost, which a person can read, by default 0.05;
         0 takes it only if it is at least as good as the list that all inputs are open to. With ``cell="min"`` it is
         always taken; there is none for Discrete actions and with ``cell="gru"``
-    :param n_episodes: of each validation, on training variations; the last ones have twice as many. By default 24, or
-        96 where there is no goal (no ``is_success`` in ``info``), since returns vary more than successes
+    :param n_episodes: of each validation, on training variations; the last ones have twice as many. By default 96, or
+        24 in the Panda tasks, whose steps are simulations
     :param env_kwargs: constructor arguments of the environment
     :param augment: makes states that were not visited, which the teacher labels too: a function from observations and
         a generator to observations, or ``"taller_towers"`` for PandaStack; ``"begun_towers"`` begins half of its

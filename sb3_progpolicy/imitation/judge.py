@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from progpolicy_envs import find_domain
 from sb3_progpolicy.imitation.rollouts import VALIDATION_SEED, Act, Episodes, Pool, Variations, Watcher, play
 from sb3_progpolicy.imitation.stalls import Patience
 from sb3_progpolicy.imitation.teachers import Observations, Teacher
 
 _DIGEST_STEPS = 50  # of the teacher, by which it is known again
 _FEW_OF, _HOPELESS = 3, 14.0  # of so many episodes one comes first; times the tolerance that these may be below
-_WITH_GOAL, _WITHOUT_GOAL = 24, 96  # episodes of a validation: returns vary more than successes
+_FEW, _MANY = 24, 96  # episodes of a validation; few where each step is a simulation
 _BEFORE_SERIES = 7  # times the number of episodes: those of all other scores
 
 
@@ -45,7 +46,7 @@ class Judge:
 
     :param pool: environments to play in
     :param variations: to play on, in turn
-    :param n_episodes: of each validation; the last ones have twice as many. ``None`` for 24, or 96 without a goal
+    :param n_episodes: of each validation; the last ones have twice as many. ``None`` for 96, or 24 in a simulation
     :param tolerance: share of the score within which another one is as good
     :param teacher: whose steps are the unit of steps
     """
@@ -56,14 +57,11 @@ class Judge:
         self.pool, self.variations, self.tolerance = pool, variations, tolerance
         self.teacher = teacher
         digest = _Digest()
-        first = n_episodes or _WITH_GOAL
-        self.teacher_episodes = play(pool, variations, first, VALIDATION_SEED, None, teacher, watcher=digest)
+        domain = find_domain(getattr(pool.envs[0].spec, "id", None))
+        self.n_episodes = n_episodes or (_FEW if domain is not None and domain.simulation else _MANY)
+        self.teacher_episodes = play(pool, variations, self.n_episodes, VALIDATION_SEED, None, teacher, watcher=digest)
         #: Of what the teacher does in its first steps.
         self.teacher_digest = digest.hexadecimal
-        self.n_episodes = n_episodes or (_WITH_GOAL if len(self.teacher_episodes.successes) else _WITHOUT_GOAL)
-        if more := self.n_episodes - len(self.teacher_episodes.returns):
-            seed = VALIDATION_SEED + self.n_episodes - more
-            self.teacher_episodes = self.teacher_episodes.and_then(play(pool, variations, more, seed, None, teacher))
         #: Whether episodes are those of the last validations, which nothing was chosen by before.
         self.final = False
         #: What ends an episode that is lost; ``None`` if all run to their end.

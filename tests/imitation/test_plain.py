@@ -309,9 +309,10 @@ def test_pieces_that_explain_nothing_are_looked_for_in_three_rounds_only():
 
 
 @pytest.mark.parametrize(
-    ("env_id", "variation", "expected"), [("Hanoi-v0", {"n_discs": 1}, 24), ("CartPole-v1", {}, 96)]
+    ("env_id", "variation", "expected"),
+    [("Hanoi-v0", {"n_discs": 1}, 96), ("PandaReach-v0", {"n_targets": 1}, 24), ("CartPole-v1", {}, 96)],
 )
-def test_where_there_is_no_goal_more_episodes_compare_candidates(env_id, variation, expected):
+def test_fewer_episodes_compare_candidates_where_each_step_is_a_simulation(env_id, variation, expected):
     with Pool(env_id, 12) as pool:
         teacher = make_teacher("planner" if variation else lambda seen: (seen[:, 2] > 0).astype(np.int64), pool.envs[0])
         judge = Judge(pool, [variation], None, 0.015, teacher)
