@@ -86,6 +86,7 @@ class Player:
 
     observation_space: Any
     choose: Callable[[Floats, Any], tuple[NDArray[Any], Any]]
+    action_space = None  # chooses what it learnt from
 
     def get_env(self) -> None:
         """It was not trained in an environment."""

@@ -152,7 +152,7 @@ def evaluate_model(
 
     def prepare(venv: VecEnv) -> VecEnv:
         assert model.observation_space is not None
-        if model.action_space != venv.action_space and not _alike(model.action_space, venv.action_space):
+        if model.action_space is not None and not _alike(model.action_space, venv.action_space):
             raise ValueError(f"the model acts in {model.action_space}; {env_id} has {venv.action_space}")
         if normalizer is not None:
             venv = _normalized(venv, normalizer)
@@ -203,7 +203,7 @@ def evaluate_any(
 
 def _alike(one: Any, other: Any) -> bool:
     """Return whether two action spaces are described alike, whatever their classes."""
-    return isinstance(one, type(other)) and action_spec(one) == action_spec(other)
+    return one == other or (isinstance(one, type(other)) and action_spec(one) == action_spec(other))
 
 
 def _mapping(name: str, value: Any) -> Mapping[str, Any]:

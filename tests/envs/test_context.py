@@ -101,5 +101,6 @@ def test_program_is_trained_saved_and_evaluated_with_it(tmp_path):
     variations = [{"n_discs": 1}, {"n_discs": 2}]
     rows = evaluate_program(program, "Hanoi-v0", variations, max_steps=5, env_kwargs={"context": "observed"})
     assert [row.optimal_steps_mean for row in rows] == [1, 3]
+    assert evaluate_program(program, "Hanoi-v0", variations, max_steps=5) == rows  # the program's own, by default
     with pytest.raises(ValueError, match="the program reads 14 numbers"):
-        evaluate_program(program, "Hanoi-v0", variations)
+        evaluate_program(program, "Hanoi-v0", variations, env_kwargs={})

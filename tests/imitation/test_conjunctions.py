@@ -97,10 +97,11 @@ def test_numbers_of_all_sums_are_tuned():
 
 def test_state_keeps_which_condition_each_sum_is_of(tmp_path):
     empty, plain = np.zeros((0, 3), dtype=np.float32), Plain(KNOWN, (0.5, 0.75), 3)
-    state = State(1, 2, {}, empty, np.zeros((0, 1)), np.zeros(0), KNOWN, (plain,), (0.5, KNOWN), (), {}, 0.0)
+    state = State(1, 2, {}, empty, np.zeros((0, 1)), np.zeros(0), KNOWN, (plain,), (0.5, KNOWN), (), {}, 0.0, True)
     save_state(tmp_path / "state.npz", {}, state)
     found = load_state(tmp_path / "state.npz", {})
     assert (found.plain[0].scores, found.plain[0].n_lost) == ((0.5, 0.75), 3)
+    assert found.has_goal
     for program in (found.present, found.best[1], found.plain[0].candidate):
         np.testing.assert_array_equal(program.branches(some_inputs()), KNOWN.branches(some_inputs()))
 
