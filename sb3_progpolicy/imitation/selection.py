@@ -23,7 +23,7 @@ _RARE, _DROPS = 0.03, 5  # share of the states in which a rare branch acts; how 
 _NEAR, _LOSS = 1.3, 0.01  # a list whose loss is so many times the best one's, and more, is not looked at
 _AGAIN = 2  # of the best plain lists play new episodes in each round, and have lists made of them
 _TRIES = 3  # rounds in which pieces are looked for, if none explain the states
-_SHORT = (7, 4, 2, 1)  # numbers of branches that are tried at the end
+_SHORT = (1, 2, 4, 7)  # numbers of branches that are tried at the end, the first that suffices is taken
 
 
 class Selection:
@@ -82,11 +82,14 @@ class Selection:
         self.learner.raw, self.reference = self.best[1], self._value(self.best)
 
     def make_short(self) -> None:
-        """Go on with lists of fewer and fewer branches as long as their episodes are as good as the best ones."""
+        """Go on with the shortest of some lists of few branches whose episodes are as good as the best ones.
+
+        Each is fitted from nothing, so that a shorter one may do where a longer one does not.
+        """
         assert self.best is not None
         most = self.best[1].n_branches
         for n_branches in (number for number in _SHORT if number < most):
-            if self._take_over(self.learner.short(n_branches)) is not None:
+            if self._take_over(self.learner.short(n_branches)) is None:
                 return
 
     def make_plain(self, series: int) -> None:

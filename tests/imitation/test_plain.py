@@ -360,3 +360,30 @@ def test_only_states_that_no_episode_comes_to_count_beside_the_episodes():
         runs = {augment: Run(*arguments, augment) for augment in (None, "begun_towers", "taller_towers")}
     assert [run.selection.augment is not None for run in runs.values()] == [False, False, True]
     assert [len(run.selection.beyond) for run in runs.values()] == [0, 0, 0]  # given tasks have no validation set
+
+
+@pytest.mark.parametrize(
+    ("reached", "expected"), [({2: 1.0}, [1, 2]), ({1: 1.0, 7: 1.0}, [1]), ({}, [1, 2, 4, 7])], ids=["2", "1", "none"]
+)
+def test_shortest_list_that_suffices_is_taken_whatever_longer_ones_do(monkeypatch, reached, expected):
+    with Pool("PandaReach-v0", 2) as pool:
+        judge = Judge(pool, [{"n_targets": 1}], 2, 0.015, make_teacher("planner", pool.envs[0]))
+    asked = []
+
+    class Lists:
+        raw = None
+
+        def short(self, n_branches):
+            asked.append(n_branches)
+            return DecisionList(np.zeros((n_branches - 1, 3)), np.zeros((n_branches, 1, 3)))
+
+        def loss_of(self, raw):
+            return 0.0
+
+    codec = ActionCodec(ActionSpec("box", (1,), (-1.0,), (1.0,)), ("x",))
+    selection = Selection(Lists(), judge, (), codec, None, 0.05)
+    selection.best, selection.reference = (1.0, DecisionList(np.zeros((9, 3)), np.zeros((10, 1, 3)))), 1.0
+    monkeypatch.setattr(selection, "score", lambda raw, needed=None: reached.get(raw.n_branches, 0.5))
+    selection.make_short()
+    assert asked == expected
+    assert selection.best[1].n_branches == (expected[-1] if reached else 10)
