@@ -20,7 +20,7 @@ from sb3_progpolicy.extraction import extract_program, holds_program, wrappers_o
 from sb3_progpolicy.interaction import VecInteractionHistory
 from sb3_progpolicy.programs.interpreter import ProgramRunner, Semantics, join_inputs
 from sb3_progpolicy.programs.syntax import ProgramData
-from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, unread_names
+from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, refuse_unread
 from sb3_progpolicy.spaces import action_spec, interaction_space, shaped
 from sb3_progpolicy.vec_env import BatchedVecEnv, make_fast_vec_env
 from sb3_progpolicy.vec_env.repeat import repeat_options
@@ -356,10 +356,7 @@ def _play(
         repeat_options(venv)
     venv.set_options(list(given))
     observations: Any = venv.reset()
-    if unread := unread_names(given):
-        raise ValueError(
-            f"the reset option {', '.join(sorted(unread))} has no effect; the environment does not read it"
-        )
+    refuse_unread(given, "the environment")
     optimal[:, 0] = _optimal_steps(venv)
     normalizer = unwrap_vec_wrapper(venv, VecNormalize)
     rewards, dones = np.zeros(n_envs, dtype=np.float32), np.zeros(n_envs, dtype=bool)

@@ -44,7 +44,7 @@ def record(
 
     from progpolicy_envs import find_domain
     from sb3_progpolicy.env_ids import spec_of
-    from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, unread_names
+    from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, refuse_unread
 
     if output.suffix.lower() not in FORMATS:
         raise ValueError(f"-o {str(output)!r} is not accepted; the file is a .gif or an .mp4")
@@ -62,10 +62,7 @@ def record(
     try:
         options = ReadOptions({name: value for name, value in variation.items() if name not in fixed})
         observation, info = env.reset(seed=seed, options=options)
-        if unread := unread_names([options]):
-            raise ValueError(
-                f"the reset option {', '.join(sorted(unread))} has no effect; {source.env_id} does not read it"
-            )
+        refuse_unread([options], source.env_id)
         env.action_space.seed(seed)
         if actor == "policy":
             act = _policy(source, semantics, env)

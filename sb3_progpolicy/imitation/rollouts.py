@@ -16,8 +16,8 @@ from sb3_progpolicy.imitation.stalls import Patience
 from sb3_progpolicy.imitation.teachers import Observations, Situation, Teacher, checked_labels, join_history
 from sb3_progpolicy.programs.interpreter import ProgramRunner, Semantics
 from sb3_progpolicy.programs.syntax import ProgramData
-from sb3_progpolicy.reptile.options import ReadOptions, unread_names
-from sb3_progpolicy.spaces import action_spec, check_observation_space, shaped
+from sb3_progpolicy.reptile.options import ReadOptions, refuse_unread
+from sb3_progpolicy.spaces import action_spec, check_observation_space
 
 Act = Callable[[Observations], NDArray[Any]]
 Variations = Sequence[Mapping[str, Any]]
@@ -50,6 +50,9 @@ class Pool:
         self.envs: list[Any] = [gym.make(spec.id, **(env_kwargs or {})) for _ in range(n_envs)]
         space = check_observation_space(self.envs[0].observation_space)
         self.spec = action_spec(self.envs[0].action_space)
+        shape = self.envs[0].action_space.shape
+        #: Of actions that are not flat by themselves.
+        self._shape = shape if self.spec.kind == "box" and len(shape) != 1 else None
         self.cap = spec.max_episode_steps or 10_000
         self.observations = np.zeros((n_envs, *space.shape), dtype=np.float32)
         self.rewards, self.dones = np.zeros(n_envs, dtype=np.float32), np.zeros(n_envs, dtype=bool)
@@ -79,10 +82,8 @@ class Pool:
             return
         options = ReadOptions(variation)
         self.observations[row] = self.envs[row].reset(seed=seed, options=options if variation else None)[0]
-        if variation and (unread := unread_names([options])):
-            raise ValueError(
-                f"the reset option {', '.join(sorted(unread))} has no effect; {self.envs[row].spec.id} does not read it"
-            )
+        if variation:
+            refuse_unread([options], self.envs[row].spec.id)
 
     def situation(self, rows: Sequence[int] | None = None) -> Situation:
         """Return what a teacher may look at."""
@@ -106,7 +107,8 @@ class Pool:
 
     def step(self, row: int, action: Any) -> tuple[bool, dict[str, Any]]:
         """Take one step; return whether the episode ended, and the infos."""
-        action = shaped(np.asarray(action)[None], self.envs[row].action_space)[0]
+        if self._shape is not None:
+            action = np.reshape(action, self._shape)
         observation, reward, terminated, truncated, info = self.envs[row].step(action)
         self.observations[row], self.rewards[row] = observation, float(reward)
         self.dones[row] = terminated or truncated

@@ -68,6 +68,17 @@ def unread_names(options: Iterable[Any]) -> set[str]:
     return set(dict.keys(given[0])).difference(*(one.read for one in given))
 
 
+def refuse_unread(options: Iterable[Any], env: str) -> None:
+    """Raise an error if no environment has looked at an option.
+
+    :param options: what each environment was given, after its reset
+    :param env: what does not read it, for the message
+    :raises ValueError: naming the options
+    """
+    if unread := unread_names(options):
+        raise ValueError(f"the reset option {', '.join(sorted(unread))} has no effect; {env} does not read it")
+
+
 def constructor_arguments(env_id: str, variation: Mapping[str, Any], env_kwargs: Mapping[str, Any]) -> set[str]:
     """Return which parameters of a variation the constructor takes and no reset reads.
 

@@ -10,7 +10,7 @@ from sb3_progpolicy.reptile.callback import check_reptile_arguments
 from sb3_progpolicy.reptile_ppo.growth import check_search_arguments
 from sb3_progpolicy.reptile_ppo.inner_loops import check_batch_arguments
 
-_WHOLE = {"n_steps": 1, "n_epochs": 1, "stats_window_size": 1, "verbose": 0}
+_WHOLE = {"n_steps": 1, "n_epochs": 1, "stats_window_size": 1}
 _OPTIONAL_WHOLE = {"n_envs": 1, "batch_size": 1, "seed": 0}
 _NUMBERS = ("gamma", "gae_lambda", "ent_coef", "vf_coef", "length_coef")
 _LIMITS = ("max_grad_norm", "target_kl")  # infinite ones limit nothing
@@ -31,7 +31,8 @@ def check_arguments(given: Mapping[str, Any]) -> None:
     check_batch_arguments(given["meta_batch_size"], given["engine"])
     check_search_arguments(given["search_method"], given["search_fraction"], given["growth_iterations"])
     for name, least in _WHOLE.items():
-        check_whole(name, int(given[name]) if name == "verbose" else given[name], least)
+        check_whole(name, given[name], least)
+    check_whole("verbose", int(given["verbose"]), 0)  # a flag will do
     for name, least in _OPTIONAL_WHOLE.items():
         if given[name] is not None:
             check_whole(name, given[name], least)
