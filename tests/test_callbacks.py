@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.callbacks import EvalCallback, StopTrainingOnRewardThreshold
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -107,3 +107,36 @@ def test_statistics_of_vec_normalize_are_taken_over():
     model.learn(32, callback=InteractionEvalCallback(evaluation, n_eval_episodes=1, eval_freq=32, verbose=0))
     np.testing.assert_array_equal(evaluation.obs_rms.mean, training.obs_rms.mean)
     assert evaluation.obs_rms.mean.any()
+
+
+def test_what_is_evaluated_and_saved_is_the_policy_between_two_tasks(tmp_path):
+    model = make(inner_updates=3, meta_learning_rate=0.1)
+    callback = InteractionEvalCallback(
+        hanoi(), n_eval_episodes=1, eval_freq=40, log_path=tmp_path, best_model_save_path=tmp_path, verbose=0
+    )
+    model.learn(96 * 2, callback=callback)  # two tasks of three rollouts of 32 steps; due after 80 and 160 steps
+    with np.load(tmp_path / "evaluations.npz") as saved:
+        assert saved["timesteps"].tolist() == [98, 192], "the first step of the second task, and the end"
+    callback = InteractionEvalCallback(
+        hanoi(), n_eval_episodes=1, eval_freq=40, best_model_save_path=tmp_path, verbose=0
+    )
+    model.learn(96, callback=callback)
+    best = ReptilePPO.load(tmp_path / "best_model").policy.state_dict()
+    for name, value in model.policy.state_dict().items():
+        np.testing.assert_array_equal(best[name], value, err_msg=name)
+
+
+def test_without_a_step_between_tasks_nothing_waits(tmp_path):
+    model = make(inner_updates=3, meta_update=False)
+    model.learn(
+        96, callback=InteractionEvalCallback(hanoi(), n_eval_episodes=1, eval_freq=20, log_path=tmp_path, verbose=0)
+    )
+    with np.load(tmp_path / "evaluations.npz") as saved:
+        assert saved["timesteps"].tolist() == [40, 80]
+
+
+def test_a_callback_after_an_evaluation_that_waited_ends_the_training():
+    model = make(inner_updates=3)
+    stop = StopTrainingOnRewardThreshold(-1e9, verbose=0)
+    model.learn(10_000, InteractionEvalCallback(hanoi(), stop, n_eval_episodes=1, eval_freq=20, verbose=0))
+    assert model.num_timesteps == 98
