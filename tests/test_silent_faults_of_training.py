@@ -1,5 +1,7 @@
 """What training and evaluation must not pass over: arguments, options, shapes, files."""
 
+import json
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_progpolicy import ReptilePPO, ReptileWrapper, evaluate_model, evaluate_program
+from sb3_progpolicy import ReptilePPO, ReptileWrapper, evaluate_model, evaluate_program, load_pretrained
 from sb3_progpolicy.cli import run
 from sb3_progpolicy.experiment.sources import find_source
 from sb3_progpolicy.reptile_ppo.loading import _check_sizes
@@ -274,3 +276,19 @@ def test_two_starts_of_a_training_are_refused(capsys):
 def test_legend_of_a_comparison_is_shown(capsys):
     assert run(["compare", "Hanoi-v0", "Hanoi-v0", "--set", "n_discs=1", "--episodes", "1"]) == 0
     assert "[share solved]" in capsys.readouterr().out
+
+
+def test_a_comparison_says_where_the_environments_differ(tmp_path, capsys):
+    same, other = str(tmp_path / "same.json"), str(tmp_path / "other.json")
+    program = load_pretrained("Hanoi-v0")
+    program.save(same)
+    program.metadata["env_kwargs"] = {"source": 2, "target": 0}
+    program.save(other)
+    arguments = ["--set", "n_discs=1", "--episodes", "1", "--json"]
+    assert run(["compare", same, other, *arguments]) == 0
+    printed = capsys.readouterr()
+    assert f"The environments differ: each run acts in the one that it was trained in, {same} in " in printed.err
+    assert f"{other} in {{'source': 2, 'target': 0}}." in printed.err.replace("\n", "")
+    assert [row["env_kwargs"] for row in json.loads(printed.out)] == [{}, {"source": 2, "target": 0}]
+    assert run(["compare", same, same, *arguments]) == 0
+    assert "differ" not in capsys.readouterr().err

@@ -29,6 +29,7 @@ def compare(
 ) -> None:
     """Evaluate several runs on the same episodes and show them side by side, as a table and as a picture.
 
+    Each run acts in an environment made with the arguments that it was trained with; where these differ, it is said.
     The picture also has the training curves of the runs that were trained with --eval-freq.
     """
     import torch
@@ -52,10 +53,14 @@ def compare(
         chosen = parse_variations(variations) if variations else default_variations(env_id)
         compared = compare_sources(sources, chosen, episodes, seed)
         learned = [None if source.program is None else source.program.learned_by for source in sources]
+    made_with = [source.env_kwargs for source in sources]
+    if any(one != made_with[0] for one in made_with):
+        each = ", ".join(f"{source.name} in {source.env_kwargs or 'the one of the defaults'}" for source in sources)
+        typer.echo(f"The environments differ: each run acts in the one that it was trained in, {each}.", err=True)
     if as_json:
         described = [
-            {"run": run.name, **row.to_json(), "learned_by": how}
-            for run, how in zip(compared, learned, strict=True)
+            {"run": run.name, **row.to_json(), "learned_by": how, "env_kwargs": own}
+            for run, how, own in zip(compared, learned, made_with, strict=True)
             for row in run.rows
         ]
         typer.echo(json.dumps(described, indent=2))
