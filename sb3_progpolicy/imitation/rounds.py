@@ -30,7 +30,7 @@ from sb3_progpolicy.spaces import action_spec
 #: Share of the teacher in each round; 0 in all later ones.
 TEACHER_SHARES = (1.0, 0.6, 0.4, 0.3, 0.2, 0.1)
 N_ROUNDS, N_PLAIN_ROUNDS, N_SPARSE_ROUNDS = 9, 10, 3
-_N_BRIEF_ROUNDS, _N_BRIEF_PLAIN_ROUNDS = 6, 8  # in place of these, where plain lists are what is asked for
+_N_BRIEF_ROUNDS = 6  # in place of N_ROUNDS, where plain lists are what is asked for
 _PLAIN_TOLERANCE = 0.05
 _CHANGED = 0.02  # share of the actions, or mean distance, that rounding may change
 #: Inputs that are not read by default: beyond the training sizes they take values that were never seen.
@@ -109,12 +109,11 @@ class Run:
         beyond = validation_variations(env_id) if tasks is None else ()
         self.selection = Selection(self.learner, self.judge, beyond, self.codec, self.augmentation, plain_tolerance)
         self.n_labelled = 0
+        #: Teachers with continuous actions may be made of pieces.
+        self.n_plain_rounds = N_PLAIN_ROUNDS if self.spec.kind == "box" else 0
         #: Whether a plain list is asked for, whatever another one reaches.
         self.wants_plain = settings.max_sums > 1
         self.n_dense_rounds = min(N_ROUNDS, _N_BRIEF_ROUNDS) if self.wants_plain else N_ROUNDS
-        n_plain_rounds = min(N_PLAIN_ROUNDS, _N_BRIEF_PLAIN_ROUNDS) if self.wants_plain else N_PLAIN_ROUNDS
-        #: Teachers with continuous actions may be made of pieces.
-        self.n_plain_rounds = n_plain_rounds if self.spec.kind == "box" else 0
 
     @property
     def n_rounds(self) -> int:
