@@ -9,6 +9,7 @@ from itertools import groupby
 from typing import Any, cast
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_wrapper
@@ -96,23 +97,16 @@ def evaluate_program(
     :return: one row for each variation
     :raises ValueError: if an argument is not accepted or the program does not fit the environment
     """
-    own_id = id_from_file(program.metadata.get("env"))
-    if env_kwargs is None and env_id in (None, own_id):
-        env_kwargs = _mapping("the program's env_kwargs", program.metadata.get("env_kwargs", {}))
-    env_id = env_id or own_id
+    if env_kwargs is None:
+        env_kwargs = own_env_kwargs(program, env_id)
+    env_id = env_id or id_from_file(program.metadata.get("env"))
     if not env_id:
         raise ValueError("the program does not say which environment it is for, or names a module; give env_id")
 
     refuse_wrappers("the program", program.metadata.get("wrappers", ()))
 
     def start(venv: VecEnv) -> Act:
-        spec, n_observations = action_spec(venv.action_space), int(np.prod(venv.observation_space.shape or ()))
-        if (spec, n_observations) != (program.action, program.n_observations):
-            raise ValueError(
-                f"the program reads {program.n_observations} numbers and acts in {program.action.kind} "
-                f"{list(program.action.sizes)}; {env_id} has {n_observations} numbers and {spec.kind} "
-                f"{list(spec.sizes)}"
-            )
+        check_fit(program, env_id, venv.observation_space, venv.action_space)
         runner = ProgramRunner(program, venv.num_envs, semantics)
         previous: NDArray[Any] | None = None
 
@@ -210,6 +204,36 @@ def _mapping(name: str, value: Any) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
         raise ValueError(f"{name}={value!r} is not accepted; it is a mapping")
     return value
+
+
+def own_env_kwargs(program: ProgramData, env_id: str | None = None) -> dict[str, Any]:
+    """Return the constructor arguments of the environment that a program was trained in, as its metadata say.
+
+    :param program: the program
+    :param env_id: where it is to act; there are none for another environment than its own
+    :raises ValueError: if the metadata hold something else
+    """
+    if env_id not in (None, id_from_file(program.metadata.get("env"))):
+        return {}
+    return dict(_mapping("the program's env_kwargs", program.metadata.get("env_kwargs", {})))
+
+
+def check_fit(
+    program: ProgramData, env_id: str | None, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+) -> None:
+    """Raise ``ValueError`` if a program does not read the observations of an environment, or acts otherwise.
+
+    :param program: the program
+    :param env_id: of the environment
+    :param observation_space: of one environment
+    :param action_space: of one environment
+    """
+    spec, n_observations = action_spec(action_space), int(np.prod(observation_space.shape or ()))
+    if (spec, n_observations) != (program.action, program.n_observations):
+        raise ValueError(
+            f"the program reads {program.n_observations} numbers and acts in {program.action.kind} "
+            f"{list(program.action.sizes)}; {env_id} has {n_observations} numbers and {spec.kind} {list(spec.sizes)}"
+        )
 
 
 def refuse_wrappers(what: str, wrappers: Sequence[str]) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_progpolicy.analysis.rollout import surroundings
 from sb3_progpolicy.analysis.terms import Floats, symmetric_part
 from sb3_progpolicy.hyperparams import load_hyperparams
 from sb3_progpolicy.programs.program import Program
@@ -91,13 +92,15 @@ def finetune(
     :param seed: of everything random
     :return: the program that comes of it, and how it was learned, as in ``learned_by``
     """
-    stateless = not any(condition.remembers for condition in program.conditions)
+    stateless, around = not any(condition.remembers for condition in program.conditions), surroundings(program, env_id)
     model = ReptilePPO(
         "PRLPolicy" if stateless else "ProgPolicy",
         env_id,
         LinearSchedule(LEARNING_RATE, 0.0, 1.0),
         gamma=float(load_hyperparams("reptile_ppo", env_id).get("gamma", 0.99)),
-        tasks=[dict(variation) for variation in variations],
+        tasks=[{**around.variation, **variation} for variation in variations],
+        env_kwargs=dict(around.kwargs),
+        max_episode_steps=around.cap,
         interaction_history=program.interaction,
         init_program=Program(**vars(program)),
         action_std=_noise(program),

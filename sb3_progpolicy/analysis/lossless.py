@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from progpolicy_envs import find_domain
-from sb3_progpolicy.analysis.rollout import make_batch
+from sb3_progpolicy.analysis.rollout import make_batch, surroundings
 from sb3_progpolicy.analysis.simplify import Simplification, simplify
 from sb3_progpolicy.programs.syntax import ProgramData
 
@@ -23,8 +23,8 @@ def lossless(program: ProgramData, env_id: str | None) -> Simplification | None:
     if domain is None or domain.simulation or program.action.kind != "discrete" or "simplified" in program.metadata:
         return None
     try:
-        batch = make_batch(program, domain.id, 1)
-        if sum(batch.count_starts(variation) for variation in domain.trained) > MAX_STARTS:
+        batch, own = make_batch(program, domain.id, 1), surroundings(program, domain.id).variation
+        if sum(batch.count_starts({**own, **variation}) for variation in domain.trained) > MAX_STARTS:
             return None
         found = simplify(program, domain.id, n_starts=MAX_STARTS, time_limit=SECONDS)
     except (ValueError, ModuleNotFoundError):  # it does not fit, its starts cannot be counted, or SciPy is missing

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,10 +10,12 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from progpolicy_envs import find_domain
 from progpolicy_envs.vector import PlanningVectorEnv
+from sb3_progpolicy.env_ids import spec_of
+from sb3_progpolicy.evaluation import check_fit, own_env_kwargs
 from sb3_progpolicy.programs.interpreter import ProgramRunner, join_inputs
 from sb3_progpolicy.programs.syntax import ProgramData
-from sb3_progpolicy.spaces import action_spec
 
 
 @dataclass(frozen=True)
@@ -49,24 +51,39 @@ def make_batch(program: ProgramData, env_id: str, n_envs: int) -> PlanningVector
     spec = gym.spec(name)
     venv: Any = None
     if spec.vector_entry_point is not None:
-        venv = gym.make_vec(name, num_envs=n_envs, vectorization_mode="vector_entry_point").unwrapped
+        kwargs = surroundings(program, env_id).kwargs
+        venv = gym.make_vec(name, num_envs=n_envs, vectorization_mode="vector_entry_point", **kwargs).unwrapped
     if not isinstance(venv, PlanningVectorEnv):
         raise ValueError(f"{env_id} is not accepted; the planning domains have starts that can be chosen")
-    given = action_spec(venv.single_action_space)
-    n_observations = int(np.prod(venv.single_observation_space.shape or ()))
-    if (given, n_observations) != (program.action, program.n_observations):
-        raise ValueError(
-            f"the program reads {program.n_observations} numbers and acts in {program.action.kind} "
-            f"{list(program.action.sizes)}; {env_id} has {n_observations} numbers and {given.kind} {list(given.sizes)}"
-        )
+    check_fit(program, env_id, venv.single_observation_space, venv.single_action_space)
     return venv
 
 
-def cap_of(env_id: str) -> int:
-    """Return the registered cap on an episode's steps."""
-    cap = gym.spec(env_id.rpartition(":")[2]).max_episode_steps
-    assert cap is not None, "all planning domains have one"
-    return cap
+@dataclass(frozen=True)
+class Surroundings:
+    """How the environment is made that a program was trained in.
+
+    :param variation: parameters of its domain that are not the defaults
+    :param kwargs: other arguments of its constructor
+    :param cap: steps after which an episode has failed; ``None`` if there is no limit
+    """
+
+    variation: Mapping[str, Any]
+    kwargs: Mapping[str, Any]
+    cap: int | None
+
+
+def surroundings(program: ProgramData, env_id: str) -> Surroundings:
+    """Return how an environment is to be made: as the program's own if it is that one, else by the defaults.
+
+    :param program: what will act in it
+    :param env_id: environment id
+    """
+    kwargs, domain = own_env_kwargs(program, env_id), find_domain(env_id)
+    cap = kwargs.pop("max_episode_steps", spec_of(env_id).max_episode_steps)
+    names = set() if domain is None or domain.space is None else set(domain.space.defaults)
+    variation = {name: kwargs.pop(name) for name in list(kwargs) if name in names}
+    return Surroundings(variation, kwargs, cap)
 
 
 def run_episodes(

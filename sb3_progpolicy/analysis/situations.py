@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progpolicy_envs.vector import PlanningVectorEnv
-from sb3_progpolicy.analysis.rollout import Step, batches, cap_of, make_batch, run_episodes, start_numbers
+from sb3_progpolicy.analysis.rollout import Step, batches, make_batch, run_episodes, start_numbers, surroundings
 from sb3_progpolicy.programs.interpreter import ProgramRunner
 from sb3_progpolicy.programs.syntax import ProgramData
 
@@ -127,16 +127,17 @@ def meet(
     collector = _Collector(program, planner)
     if known is not None:
         collector.add_known(known)
-    rng, cap = np.random.default_rng(seed), cap_of(env_id)
+    rng, around = np.random.default_rng(seed), surroundings(program, env_id)
+    assert around.cap is not None, "all planning domains have one"
     starts, exhaustive = 0, True
-    for variation in variations:
+    for variation in ({**around.variation, **given} for given in variations):
         count = make_batch(program, env_id, 1).count_starts(variation)
         numbers = start_numbers(count, n_starts, rng)
         exhaustive &= len(numbers) == count
         for part in batches(numbers, BATCH):
             venv = make_batch(program, env_id, len(part))
             observations = venv.reset_to(variation, part)
-            run_episodes(program, venv, observations, venv.optimal_steps(), cap, collector)
+            run_episodes(program, venv, observations, venv.optimal_steps(), around.cap, collector)
         starts += len(numbers)
     return collector.situations(program, starts, exhaustive)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,14 @@ from numpy.typing import NDArray
 
 from progpolicy_envs import find_domain
 from sb3_progpolicy.analysis.checkpoint import Checkpoint
-from sb3_progpolicy.analysis.rollout import cap_of, make_batch, run_episodes, start_numbers
-from sb3_progpolicy.evaluation import refuse_wrappers
+from sb3_progpolicy.analysis.rollout import make_batch, run_episodes, start_numbers, surroundings
+from sb3_progpolicy.env_ids import spec_of
+from sb3_progpolicy.evaluation import check_fit, own_env_kwargs, refuse_wrappers
 from sb3_progpolicy.programs.interpreter import ProgramRunner, join_inputs
 from sb3_progpolicy.programs.io import program_digest
 from sb3_progpolicy.programs.syntax import ProgramData
+from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, refuse_unread
+from sb3_progpolicy.spaces import shaped
 
 #: Numbers of starts: all of them, or those drawn.
 Numbers = range | NDArray[np.int64]
@@ -76,6 +79,9 @@ def verify(
 ) -> list[Verification]:
     """Run the crisp program once from every start of each variation, its memory being empty.
 
+    The environment is made with the arguments that the program was trained with, as its metadata say, if it is the
+    program's own.
+
     In the planning domains starts can be counted: pairs of pegs, places of plates and gripper, sets of stars. Where
     they cannot, or there are more than :data:`MAX_STARTS`, a number of them is drawn, and the share of those that are
     solved has a bound. A bound is a test, and not a proof.
@@ -92,7 +98,8 @@ def verify(
     :param progress: is called with the number of starts done and that of all of a variation
     :param checkpoint: file in which the counts are kept; one that exists is gone on from, with the same arguments
     :return: one row for each variation
-    :raises ValueError: if an argument is not accepted, or the file is of another verification
+    :raises ValueError: if an argument is not accepted, the program does not fit, the environment has no goal, or the
+        file is of another verification
     """
     env_id = env_id or str(program.metadata.get("env") or "")
     if not env_id:
@@ -107,8 +114,17 @@ def verify(
         variations = [{}] if domain is None else domain.trained
     rng = np.random.default_rng(seed)
     given = {"from_any_state": from_any_state, "all_starts": all_starts, "n_starts": n_starts, "max_steps": max_steps}
-    listed = [dict(variation) for variation in variations]
-    origin = {"program": program_digest(program), "env": env_id, "variations": listed, **given, "seed": seed}
+    around = surroundings(program, env_id)
+    listed = [{**around.variation, **variation} for variation in variations]
+    origin: dict[str, Any] = {
+        "program": program_digest(program),
+        "env": env_id,
+        "variations": listed,
+        **given,
+        "seed": seed,
+    }
+    if around.kwargs or around.variation:
+        origin["env_kwargs"] = own_env_kwargs(program, env_id)
     kept = Checkpoint(None if checkpoint is None else Path(checkpoint), origin)
     rows = [Verification(**row) for row in kept.rows]
     for place, variation in enumerate(listed):
@@ -169,7 +185,7 @@ def _counted(
             venv = make_batch(program, env_id, len(part))
         observations = venv.reset_to(variation, part, any_state)
         optimal = venv.optimal_steps()
-        cap = max_steps or max(cap_of(env_id), 2 * int(optimal.max()))
+        cap = max_steps or max(surroundings(program, env_id).cap or 0, 2 * int(optimal.max()))
         steps = run_episodes(program, venv, observations, optimal, cap)
         shortest = tally.add(steps, optimal.astype(np.float64))
         if shortest is not None:
@@ -192,13 +208,24 @@ def _sampled(
     progress: Callable[[int, int], None] | None,
 ) -> Verification:
     """Run a program in single environments, each episode from a seed of its own."""
+    around, spec = surroundings(program, env_id), spec_of(env_id)
+    cap = around.cap if max_steps is None else max_steps
+    if cap is None:
+        raise ValueError(f"{env_id} has no cap on the steps of an episode; give max_steps")
+    made = set() if find_domain(env_id) else constructor_arguments(env_id, variation, around.kwargs)
+    fixed = {name: value for name, value in variation.items() if name in made}
+    options = {name: value for name, value in variation.items() if name not in made}
     tally = _Tally()
-    env = gym.make(env_id, max_episode_steps=max_steps)
+    env = gym.make(spec.id, **{**around.kwargs, **fixed, "max_episode_steps": cap})
     try:
+        check_fit(program, env_id, env.observation_space, env.action_space)
         for number in range(n_starts):
-            observation, info = env.reset(seed=seed + number, options=dict(variation) or None)
+            read = ReadOptions(options)
+            observation, info = env.reset(seed=seed + number, options=read if options else None)
+            if options:
+                refuse_unread([read], env_id)
             optimal = info.get("optimal_steps")
-            steps = next((step for step, solved in _episode(program, env, observation) if solved), -1)
+            steps = _steps_to_goal(program, env, env_id, observation)
             failed = tally.add(np.array([steps]), np.array([np.nan if optimal is None else optimal]))
             if failed is not None:
                 tally.counterexample = {"seed": seed + number, "options": dict(variation)}
@@ -209,15 +236,21 @@ def _sampled(
     return tally.row(variation, exhaustive=False)
 
 
-def _episode(program: ProgramData, env: gym.Env[Any, Any], observation: Any) -> Iterator[tuple[int, bool]]:
-    """Yield after each step its number and whether the goal is reached."""
-    runner, previous, reward, step, over = ProgramRunner(program), None, 0.0, 0, False
-    while not over:
+def _steps_to_goal(program: ProgramData, env: gym.Env[Any, Any], env_id: str, observation: Any) -> int:
+    """Return in how many steps the goal is reached, -1 if the episode ends before."""
+    runner, previous, reward, step = ProgramRunner(program), None, 0.0, 0
+    while True:
         flat = np.asarray(observation, dtype=np.float64).reshape(1, -1)
-        action = runner.act(join_inputs(program, flat, previous, np.float32(reward), False))
-        observation, reward, terminated, truncated, info = env.step(action[0])  # type: ignore[assignment]
-        previous, step, over = action, step + 1, terminated or truncated
-        yield step, bool(info.get("is_success", False))
+        previous = runner.act(join_inputs(program, flat, previous, np.float32(reward), False))
+        action = shaped(previous, env.action_space)[0]
+        observation, reward, terminated, truncated, info = env.step(action)  # type: ignore[assignment]
+        step += 1
+        if info.get("is_success", False):
+            return step
+        if terminated or truncated:
+            if "is_success" not in info:
+                raise ValueError(f"{env_id} does not say whether its goal is reached; evaluate measures returns")
+            return -1
 
 
 class _Tally:
@@ -292,9 +325,11 @@ def certificate(program: ProgramData, env_id: str, rows: Sequence[Verification],
     """
     from importlib.metadata import version
 
+    own = own_env_kwargs(program, env_id)
     return {
         "program": program_digest(program),
         "env": env_id,
+        **({"env_kwargs": own} if own else {}),
         "command": command,
         "versions": {name: version(name) for name in ("sb3-progpolicy", "gymnasium", "numpy")},
         "rows": [row.to_json() for row in rows],

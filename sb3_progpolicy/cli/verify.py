@@ -47,6 +47,7 @@ def verify(
     certificate, an interrupted run goes on when it is started again.
     """
     from sb3_progpolicy.analysis.verify import certificate
+    from sb3_progpolicy.evaluation import own_env_kwargs
     from sb3_progpolicy.programs.files import write_atomically
 
     if output is not None:
@@ -73,7 +74,7 @@ def verify(
         from sb3_progpolicy.experiment.film import record
 
         reset = failing[0].counterexample or {}
-        played = Source(run_or_name, env_id, program, None, {})
+        played = Source(run_or_name, env_id, program, None, own_env_kwargs(program, env_id))
         record(played, output, reset["options"], seed=reset.get("seed", 0))
         typer.echo(f"Wrote {output}", err=True)
     elif output is not None:

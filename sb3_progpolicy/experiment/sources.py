@@ -50,7 +50,10 @@ def find_program(name: str, env: str | None = None, allow_pickle: bool = False) 
     env_id = env or source.env_id
     if env_id is None:
         raise ValueError(f"{name} does not say which environment it is for; give --env")
-    return source.program, env_id
+    program = source.program
+    if source.env_kwargs:
+        program = replace(program, metadata={**program.metadata, "env_kwargs": source.env_kwargs})
+    return program, env_id
 
 
 def find_source(name: str, allow_pickle: bool = False) -> Source:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from progpolicy_envs import DOMAINS
-from sb3_progpolicy import load_pretrained
+from sb3_progpolicy import ReptilePPO, evaluate_program, load_pretrained
+from sb3_progpolicy.analysis.rollout import surroundings
 from sb3_progpolicy.analysis.simplify import simplify
 from sb3_progpolicy.analysis.verify import success_bound, verify
 from sb3_progpolicy.cli import run
@@ -182,3 +183,42 @@ def test_maps_that_are_drawn_are_sampled():
     assert domain.simulation is False
     (row,) = verify(idle("Hiking-v0"), "Hiking-v0", [{"n_stars": 1, "layout": "random"}], n_starts=4, max_steps=20)
     assert (row.starts, row.exhaustive) == (4, False)
+
+
+def test_the_environment_is_made_as_in_training():
+    program = load_pretrained("Hiking-v0")
+    elsewhere = dataclasses.replace(program, metadata={**program.metadata, "env_kwargs": {"layout": "comb"}})
+    (own,) = verify(elsewhere, variations=[{"n_stars": 1}], n_starts=20)
+    (given,) = verify(program, variations=[{"n_stars": 1, "layout": "comb"}], n_starts=20)
+    (default,) = verify(program, variations=[{"n_stars": 1}], n_starts=20)
+    assert own == given
+    assert own.variation == {"layout": "comb", "n_stars": 1}
+    assert own.solved < default.solved == 20
+    (row,) = evaluate_program(elsewhere, variations=[{"n_stars": 1}], n_episodes=5)
+    assert row.success_rate < 1
+    (chosen,) = verify(elsewhere, variations=[{"n_stars": 1, "layout": "valley"}], n_starts=20)
+    assert chosen.solved == 20, "what is set is in force"
+
+
+def test_a_cap_of_ones_own_and_other_arguments_are_in_force():
+    program = load_pretrained("Hiking-v0")
+    capped = dataclasses.replace(program, metadata={**program.metadata, "env_kwargs": {"max_episode_steps": 3}})
+    assert surroundings(capped, "Hiking-v0").cap == 3
+    assert surroundings(program, "Hiking-v0").cap == 500
+    observed = dataclasses.replace(program, metadata={**program.metadata, "env_kwargs": {"context": "observed"}})
+    with pytest.raises(ValueError, match="the program reads 80 numbers .* has 8. numbers"):
+        verify(observed, variations=[{"n_stars": 1}], n_starts=2)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "variation", "message"),
+    [
+        ("CartPole-v1", {}, "CartPole-v1 does not say whether its goal is reached"),
+        ("CartPole-v1", {"nonsense": 4}, "nonsense"),
+        ("Acrobot-v1", {}, "the program reads 4 numbers .* Acrobot-v1 has 6 numbers"),
+    ],
+)
+def test_environments_that_are_not_of_a_domain_are_checked(env_id, variation, message):
+    model = ReptilePPO("ProgPolicy", "CartPole-v1", n_steps=8, batch_size=8, seed=0, device="cpu")
+    with pytest.raises(ValueError, match=message):
+        verify(model.program(), env_id, [variation], n_starts=2)
