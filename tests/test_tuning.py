@@ -1,7 +1,10 @@
 """The search for hyperparameters: what is tried, what counts, and that it goes on where it was."""
 
+from dataclasses import replace
+
 import optuna
 import pytest
+from optuna.trial import TrialState
 
 from progpolicy_envs import DOMAINS
 from sb3_progpolicy.cli import run
@@ -73,8 +76,31 @@ def test_study_goes_on_where_it_was(tmp_path, capsys):
     again = open_study(more, storage)
     tune(more, again, reports.append)
     assert [trial.number for trial in reports] == [2]
-    with pytest.raises(ValueError, match="give another --study-name"):
-        open_study(Tuning("ppo", "Hanoi-v0", n_timesteps=512, search=SEARCH), storage)
+    for other in ({"n_timesteps": 512}, {"episodes": 2}, {"max_seconds": 1.0}, {"search": {"gamma": [0.9, 0.99]}}):
+        with pytest.raises(ValueError, match=r"is of .*, not of .*; give another --study-name"):
+            open_study(replace(more, **other), storage)
+
+
+def test_who_opens_a_study_again_draws_other_values(tmp_path):
+    storage = f"sqlite:///{tmp_path / 'tuning.db'}"
+    tuning = Tuning("ppo", "Hanoi-v0", search={"learning_rate": {"low": 1e-5, "high": 1.0, "log": True}})
+    drawn = [
+        [suggest(study.ask(), tuning.space)["learning_rate"] for _ in range(2)]
+        for study in (open_study(tuning, storage) for _ in range(3))
+    ]
+    assert len({value for pair in drawn for value in pair}) == 6
+    first = open_study(tuning, f"sqlite:///{tmp_path / 'other.db'}")
+    assert [suggest(first.ask(), tuning.space)["learning_rate"] for _ in range(2)] == drawn[0], "the seed decides"
+
+
+def test_a_first_trial_that_was_stopped_is_tried_again(tmp_path):
+    storage = f"sqlite:///{tmp_path / 'tuning.db'}"
+    tuning = Tuning("ppo", "Hanoi-v0", search=SEARCH)
+    study = open_study(tuning, storage)
+    study.tell(study.ask(), state=TrialState.FAIL)
+    again = open_study(tuning, storage)
+    assert again.ask().user_attrs == {"defaults": True}
+    assert len(open_study(tuning, storage).trials) == 2, "it is running"
 
 
 def test_values_that_do_not_go_together_cost_a_trial_and_no_more():

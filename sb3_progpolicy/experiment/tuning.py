@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from progpolicy_envs import Domain, get_domain
 from sb3_progpolicy.env_ids import spec_of
@@ -185,11 +188,13 @@ def open_study(tuning: Tuning, storage: str | None, name: str | None = None) -> 
     :param tuning: what is tuned
     :param storage: URL of a database, such as ``sqlite:///tuning.db``; ``None`` keeps it in memory
     :param name: of the study; made of method and environment by default
-    :raises ValueError: if the study is of something else
+    :raises ValueError: if the study is of something else: method, environment, steps, seed, episodes, limit of time or
+        space
     """
     import optuna
     from optuna.exceptions import ExperimentalWarning
     from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback
+    from optuna.trial import TrialState
 
     database: Any = None
     if storage is not None:
@@ -197,21 +202,34 @@ def open_study(tuning: Tuning, storage: str | None, name: str | None = None) -> 
             warnings.simplefilter("ignore", ExperimentalWarning)
             retry: Callable[..., None] = RetryHeartbeatStaleTrialCallback(max_retry=3)
             database = RDBStorage(storage, heartbeat_interval=HEARTBEAT, heartbeat_stale_trial_callback=retry)
-    sampler = optuna.samplers.TPESampler(n_startup_trials=tuning.n_startup_trials, seed=tuning.seed)
     study = optuna.create_study(
-        storage=database,
-        study_name=name or f"{tuning.algo} on {tuning.env}",
-        sampler=sampler,
-        direction="minimize",
-        load_if_exists=True,
+        storage=database, study_name=name or f"{tuning.algo} on {tuning.env}", direction="minimize", load_if_exists=True
     )
-    described = {"algo": tuning.algo, "env": tuning.env, "n_timesteps": tuning.config({}).n_timesteps}
+    described = {
+        "algo": tuning.algo,
+        "env": tuning.env,
+        "n_timesteps": tuning.config({}).n_timesteps,
+        "seed": tuning.seed,
+        "episodes": tuning.episodes,
+        "max_seconds": tuning.max_seconds,
+        "space": json.loads(json.dumps(tuning.space)),
+    }
     known = study.user_attrs.get("tuning")
     if known is None:
         study.set_user_attr("tuning", described)
+    else:
+        differing = [key for key, value in known.items() if described.get(key) != value]
+        if differing:
+            was, given = ({key: one.get(key) for key in differing} for one in (known, described))
+            raise ValueError(f"the study {study.study_name!r} is of {was}, not of {given}; give another --study-name")
+    # Who opens it again, or works on it beside others, must not draw the same values again.
+    opened = int(study.user_attrs.get("opened", 0))
+    study.set_user_attr("opened", opened + 1)
+    seed = tuning.seed if not opened else int(np.random.SeedSequence((tuning.seed, opened)).generate_state(1)[0])
+    study.sampler = optuna.samplers.TPESampler(n_startup_trials=tuning.n_startup_trials, seed=seed)
+    alive = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.WAITING, TrialState.RUNNING)
+    if not any(trial.user_attrs.get(DEFAULTS) for trial in study.get_trials(deepcopy=False, states=alive)):
         study.enqueue_trial({}, user_attrs={DEFAULTS: True})
-    elif known != described:
-        raise ValueError(f"the study {study.study_name!r} is of {known}, not of {described}; give another --study-name")
     return study
 
 

@@ -206,7 +206,7 @@ def test_a_cap_of_ones_own_and_other_arguments_are_in_force():
     assert surroundings(capped, "Hiking-v0").cap == 3
     assert surroundings(program, "Hiking-v0").cap == 500
     observed = dataclasses.replace(program, metadata={**program.metadata, "env_kwargs": {"context": "observed"}})
-    with pytest.raises(ValueError, match="the program reads 80 numbers .* has 8. numbers"):
+    with pytest.raises(ValueError, match=r"the program reads 80 numbers .* has 8\d numbers"):
         verify(observed, variations=[{"n_stars": 1}], n_starts=2)
 
 
