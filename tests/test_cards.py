@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from sb3_progpolicy import ReptilePPO
 from sb3_progpolicy.cli import run
 from sb3_progpolicy.experiment.comparison import read_curve
 
@@ -53,6 +54,29 @@ def test_card_of_a_shipped_program(tmp_path):
     text = output.read_text(encoding="utf-8")
     assert "| n_discs 7 | extrapolated | 100% | 127.0 ± 0.0 | 127.0 | 1.00 |" in text
     assert "gif" not in text
+
+
+def test_a_card_says_what_was_trained_on(tmp_path):
+    """PPO is trained on the domain's default alone, three discs."""
+    output, small = tmp_path / "card.md", ["n_envs:4", "n_steps:16", "batch_size:64"]
+    arguments = ["train", "--algo", "ppo", "--env", "Hanoi-v0", "--seed", "0", "-n", "64", "-f", str(tmp_path)]
+    assert run([*arguments, "--verbose", "0", "--hyperparams", *small]) == 0
+    folder = str(tmp_path / "ppo" / "Hanoi-v0_1")
+    arguments = ["card", folder, "--allow-pickle", "--set", "n_discs=2,3", "--episodes", "1"]
+    assert run([*arguments, "-o", str(output)]) == 0
+    text = output.read_text(encoding="utf-8")
+    assert "| n_discs 2 | easier |" in text
+    assert "| n_discs 3 | trained |" in text
+
+
+def test_a_card_where_there_is_no_goal(tmp_path):
+    program = ReptilePPO("ProgPolicy", "CartPole-v1", n_steps=8, batch_size=8, seed=0, device="cpu").program()
+    program.save(tmp_path / "pole.json")
+    assert run(["card", str(tmp_path / "pole.json"), "--episodes", "1", "-o", str(tmp_path / "card.md")]) == 0
+    text = (tmp_path / "card.md").read_text(encoding="utf-8")
+    assert "![as it is: " in text
+    assert "goal" not in text
+    assert "fails" not in text
 
 
 def test_comparison_is_on_the_same_episodes(runs, tmp_path, capsys):

@@ -232,6 +232,10 @@ def prune(
     return _finetuned(pruned, partial(train, symmetries=tying), finetune_for, measure, good_enough)
 
 
+def _as_good(point: Point, good_enough: GoodEnough) -> tuple[bool, float]:
+    return good_enough(point.success_rate, point.steps_mean), point.success_rate
+
+
 class _Found(NamedTuple):
     point: Point
     curve: tuple[Point, ...]
@@ -254,7 +258,9 @@ def _by_path(
             make_pruner(program, states, symmetries if tied else ()), measure, good_enough, n_terms is not None
         )
         if n_terms is not None:
-            best = next((point for point in curve if point.terms == n_terms), None)
+            # Several may have so many terms: those that were added one by one, and others of which some were left out.
+            points = [point for point in curve if point.terms == n_terms]
+            best = max(points, key=lambda point: (*_as_good(point, good_enough), -point.steps_mean), default=None)
             if best is None:
                 known = ", ".join(str(point.terms) for point in curve)
                 raise ValueError(f"n_terms={n_terms} is not accepted; there are programs of {known} terms")

@@ -13,18 +13,15 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from progpolicy_envs import Domain, get_domain
-from progpolicy_envs.variation import Variation
+from progpolicy_envs import get_domain
 from sb3_progpolicy.benchmark.suite import Cell
 from sb3_progpolicy.evaluation import evaluate_any
 from sb3_progpolicy.experiment import folder as folders
 from sb3_progpolicy.experiment import run
 from sb3_progpolicy.experiment.budget import ProcessorTimeLimit
-from sb3_progpolicy.experiment.config import RunConfig
 from sb3_progpolicy.experiment.methods import METHODS
 from sb3_progpolicy.extraction import holds_program
 from sb3_progpolicy.programs.files import write_atomically
-from sb3_progpolicy.reptile.tasks import TaskDistribution
 from sb3_progpolicy.vec_env.factory import simulations_in_this_process
 
 #: Seed of the first training variation's evaluation; far from those of training.
@@ -143,7 +140,7 @@ def _train(cell: Cell, folder: Path) -> BaseAlgorithm:
 def _evaluate(cell: Cell, model: BaseAlgorithm) -> list[dict[str, Any]]:
     config = cell.config
     domain = get_domain(config.env)
-    trained_on = trained_variations(config, domain)
+    trained_on = run.trained_variations(config, domain)
     sets = {"train": domain.trained, "unseen": domain.unseen}
     rows = []
     for name, variations in sets.items():
@@ -163,21 +160,6 @@ def _evaluate(cell: Cell, model: BaseAlgorithm) -> list[dict[str, Any]]:
                 del row[column]
             rows.append({"set": name, "relation": domain.relation(dict(result.variation), trained_on), **row})
     return rows
-
-
-def trained_variations(config: RunConfig, domain: Domain) -> tuple[Variation, ...]:
-    """Return the variations that a configuration trains on.
-
-    :param config: of the training
-    :param domain: of its environment
-    """
-    tasks = config.hyperparams.get("tasks")
-    if tasks is None and METHODS[config.algo].across_variations:
-        return domain.train
-    space = domain.space
-    fixed = {**({} if space is None else space.defaults), **config.env_kwargs}
-    chosen = TaskDistribution(tasks).variations if tasks is not None else [{}]
-    return tuple({**fixed, **variation} for variation in chosen)
 
 
 def commit_of_source() -> str:

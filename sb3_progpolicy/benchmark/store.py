@@ -256,6 +256,13 @@ class Store:
             query = sa.select(_CELLS.c.key, _CELLS.c.status).where(_CELLS.c.key.in_(keys))
             return {row.key: row.status for row in connection.execute(query)}
 
+    def n_outside(self) -> int:
+        """Return how many cells are of no suite here, so that no table shows them."""
+        with self.engine.connect() as connection:
+            members = sa.select(_MEMBERS.c.key)
+            query = sa.select(sa.func.count()).select_from(_CELLS).where(_CELLS.c.key.not_in(members))
+            return int(connection.execute(query).scalar_one())
+
     def errors(self, keys: Sequence[str]) -> dict[str, str]:
         """Return why cells have failed.
 

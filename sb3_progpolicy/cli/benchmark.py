@@ -128,7 +128,14 @@ def import_(
 
     with open_store(store) as opened:
         new, known = read_archive(opened, archive)
+        outside = opened.n_outside()
     typer.echo(f"{new} cells taken over, {known} known already")
+    if outside:
+        typer.echo(
+            f"{outside} of all cells here are of seeds or settings that the store's suite does not have, and in no "
+            "table; 'benchmark run' with a suite that has them takes them in",
+            err=True,
+        )
 
 
 def report(

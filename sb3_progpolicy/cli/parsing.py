@@ -68,6 +68,8 @@ def parse_variations(pairs: Iterable[str]) -> list[dict[str, Any]]:
         items = [item.strip() for item in _split(listed)]
         if not equals or not name.isidentifier() or not all(items):
             raise ValueError(f"--set {shortened(pair)} is not accepted; give name=value, a list 5,6,7 or a range 1-8")
+        if name in values:
+            raise ValueError(f"--set {shortened(pair)} is not accepted: {name} is given twice; give all in one, as 5,6")
         values[name] = [value for item in items for value in _expand(pair, item)]
     combinations = list(product(*values.values()))
     return [dict(zip(values, combination, strict=True)) for combination in combinations]

@@ -20,7 +20,7 @@ from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.programs.syntax import inputs_read
 
 FORMATS = ("text", "latex", "dot", "python", "c", "javascript", "png", "activity", "html", "onnx")
-FOR_READING = ("text", "latex", "dot", "png", "activity", "html")
+FOR_READING = ("text", "latex", "dot", "png", "html")
 _OF_SUFFIX = {
     ".txt": "text",
     ".tex": "latex",
@@ -56,12 +56,18 @@ def show(
     What is for reading (text, latex, dot, png, html) is simplified first where that is proven to change no decision
     from any start of training. What is for running has the numbers as they were learnt.
     """
-    if format_ is None:
-        format_ = _OF_SUFFIX.get(output.suffix.lower(), "text") if output is not None else "text"
-    if format_ not in FORMATS:
+    if format_ not in (None, *FORMATS):
         raise unknown("format", format_, FORMATS)
     if output is not None:
         check_folder(output)
+        if format_ is None:
+            _check_ending(output)
+        if output.exists() and Path(run_or_name).exists() and output.samefile(run_or_name):
+            raise ValueError(f"-o {str(output)!r} is not accepted; it is the program itself")
+    if format_ is None:
+        format_ = _OF_SUFFIX.get(output.suffix.lower(), "text") if output is not None else "text"
+    if format_ != "activity" and (variation or seed):
+        raise ValueError("--set and --seed are for --format activity")
     with quiet_stdout():
         source = find_source(run_or_name, allow_pickle)
         if source.program is None:
@@ -87,6 +93,13 @@ def show(
     else:
         write_atomically(output, content)
         typer.echo(f"Wrote {output}", err=True)
+
+
+def _check_ending(output: Path) -> None:
+    """Raise ``ValueError`` if a file's name does not say what to write."""
+    if output.suffix and output.suffix.lower() not in _OF_SUFFIX:
+        listed = ", ".join(_OF_SUFFIX)
+        raise ValueError(f"-o {str(output)!r} is not accepted; it ends in {listed}, or --format says what to write")
 
 
 def _file_stem(env_id: str | None) -> str:

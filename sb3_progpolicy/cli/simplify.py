@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import json
 from pathlib import Path
@@ -64,10 +65,14 @@ def simplify(
         check_folder(curve)
         if curve.suffix.lower() not in (".csv", ".png"):
             raise ValueError(f"--curve {str(curve)!r} is not accepted; the file is a .csv or a .png")
+        if curve.suffix.lower() == ".png" and importlib.util.find_spec("matplotlib") is None:
+            raise ValueError('png needs matplotlib: pip install "sb3-progpolicy[plot]"')
     from sb3_progpolicy.analysis.simplify import simplify as simplified
 
     with quiet_stdout():
         program, env_id = find_program(run_or_name, env, allow_pickle)
+        if curve is not None and program.action.kind != "box" and equally_good != "outcome":
+            raise ValueError("--curve is for continuous actions, or with --equally-good outcome")
         found = simplified(
             program,
             env_id,
@@ -81,12 +86,12 @@ def simplify(
             finetune=finetune,
             seed=seed,
         )
-        if curve is not None:
-            if not found.curve:
-                raise ValueError("--curve is for continuous actions, or with --equally-good outcome")
-            _write_curve(found, curve)
         if output is not None:
             found.program.save(output)
+        if curve is not None and found.curve:
+            _write_curve(found, curve)
+        elif curve is not None:
+            typer.echo("No number can be left out, so there is no curve.", err=True)
         rows = _compared(program, found.program, env_id, episodes, seed)
     if as_json:
         typer.echo(json.dumps({**found.to_json(), "evaluation": rows}, indent=1))
@@ -106,10 +111,8 @@ def _write_curve(found: Simplification, path: Path) -> None:
         rows = [",".join(CURVE), *(",".join(str(getattr(point, name)) for name in CURVE) for point in found.curve)]
         write_atomically(path, "\n".join(rows) + "\n")
         return
-    try:
-        import matplotlib
-    except ImportError:
-        raise ValueError('png needs matplotlib: pip install "sb3-progpolicy[plot]"') from None
+    import matplotlib
+
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 

@@ -13,6 +13,7 @@ from sb3_progpolicy.evaluation import Evaluation
 from sb3_progpolicy.experiment.film import record
 from sb3_progpolicy.experiment.folder import CONFIG, VERSIONS, read_config, timesteps_of
 from sb3_progpolicy.experiment.methods import METHODS
+from sb3_progpolicy.experiment.run import trained_variations
 from sb3_progpolicy.experiment.sources import Source, evaluate_source
 from sb3_progpolicy.hyperparams import read_yaml
 from sb3_progpolicy.programs import export_text
@@ -37,15 +38,14 @@ def write_card(
     :param film: whether to film a program
     """
     rows = evaluate_source(source, variations, n_episodes)
-    lines = [f"# {_title(source, folder)}", "", *_training(source, folder), *_table(source, rows, n_episodes)]
+    lines = [f"# {_title(source, folder)}", "", *_training(source, folder), *_table(source, folder, rows, n_episodes)]
     if source.program is not None:
         if film:
             picture = output.with_suffix(".gif")
             steps, success = record(source, picture, variations[-1])
-            words = ", ".join(f"{name} {value}" for name, value in variations[-1].items())
-            outcome = "goal reached" if success else "goal not reached"
-            lines += ["## Film", "", f"![{words}: {steps} steps, {outcome}]({picture.name})", ""]
-            lines += [f"{words}: {steps} steps, {outcome}.", ""]
+            outcome = {True: ", goal reached", False: ", goal not reached", None: ""}[success]
+            words = f"{_name(variations[-1])}: {steps} steps{outcome}"
+            lines += ["## Film", "", f"![{words}]({picture.name})", "", f"{words}.", ""]
         lines += ["## Program", "", "```", export_text(source.program).rstrip(), "```", ""]
     write_atomically(output, "\n".join(lines))
 
@@ -95,20 +95,27 @@ def _training(source: Source, folder: Path | None) -> list[str]:
     ]
 
 
-def _table(source: Source, rows: Sequence[Evaluation], n_episodes: int) -> list[str]:
+def _name(variation: Mapping[str, Any]) -> str:
+    return ", ".join(f"{key} {value}" for key, value in variation.items()) or "as it is"
+
+
+def _table(source: Source, folder: Path | None, rows: Sequence[Evaluation], n_episodes: int) -> list[str]:
     domain = find_domain(source.env_id)
+    trained = None if domain is None or folder is None else trained_variations(read_config(folder), domain)
     lines = [
         "## Results",
         "",
-        f"{n_episodes} episodes on each variation; one that fails counts as the cap on steps. "
+        f"{n_episodes} episodes on each variation"
+        + (". " if all(row.success_rate is None for row in rows) else "; one that fails counts as the cap on steps. ")
         + ("The program is run crisp, as it is read." if source.program is not None else "Most likely actions."),
         "",
         "| variation | training | success | steps | planner | ratio | return |",
         "|---|---|---:|---:|---:|---:|---:|",
     ]
     for row in rows:
-        relation = "" if domain is None or domain.size not in row.variation else domain.relation(dict(row.variation))
-        name = ", ".join(f"{key} {value}" for key, value in row.variation.items()) or "as it is"
+        known = domain is not None and domain.size in row.variation
+        relation = domain.relation(dict(row.variation), trained) if domain is not None and known else ""
+        name = _name(row.variation)
         optimum = "-" if row.optimal_steps_mean is None else f"{row.optimal_steps_mean:.1f}"
         ratio = "-" if row.ratio is None else f"{row.ratio:.2f}"
         steps = f"{row.steps_mean:.1f} ± {row.steps_std:.1f}"

@@ -123,7 +123,7 @@ def _planner(env: Any) -> Act:
     if not hasattr(env.unwrapped, "plan"):
         raise ValueError(f"--planner is not accepted for {env.spec.id}; it is for {', '.join(DOMAINS)}")
     planned = iter(env.unwrapped.plan())
-    return lambda observation, reward, done: next(planned)
+    return lambda observation, reward, done: next(planned, None)
 
 
 def _play(
@@ -138,7 +138,10 @@ def _play(
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("playing", total=optimal or cap)
         while not done:
-            observation, reward, terminated, truncated, info = env.step(act(observation, reward, done))
+            action = act(observation, reward, done)
+            if action is None:  # the plan has come to its end
+                break
+            observation, reward, terminated, truncated, info = env.step(action)
             done = terminated or truncated
             steps += 1
             show(env.render())

@@ -16,7 +16,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from progpolicy_envs import find_domain
+from progpolicy_envs import Domain, find_domain
+from progpolicy_envs.variation import Variation
 from sb3_progpolicy.evaluation import evaluate_any, success_and_steps
 from sb3_progpolicy.experiment.config import REPTILE, RunConfig, check_surroundings, parse_schedule
 from sb3_progpolicy.experiment.folder import (
@@ -76,6 +77,21 @@ def _reptile_wrapper(config: RunConfig, arguments: dict[str, Any]) -> ReptileWra
     for name in ("tasks", "sampler"):
         arguments.pop(name, None)
     return ReptileWrapper(_tasks(config), **arguments)
+
+
+def trained_variations(config: RunConfig, domain: Domain) -> tuple[Variation, ...]:
+    """Return the variations that a configuration trains on.
+
+    :param config: of the training
+    :param domain: of its environment
+    """
+    tasks = config.hyperparams.get("tasks")
+    if tasks is None and METHODS[config.algo].across_variations:
+        return domain.train
+    space = domain.space
+    fixed = {**({} if space is None else space.defaults), **config.env_kwargs}
+    chosen = TaskDistribution(tasks).variations if tasks is not None else [{}]
+    return tuple({**fixed, **variation} for variation in chosen)
 
 
 def _tasks(config: RunConfig) -> TaskDistribution:

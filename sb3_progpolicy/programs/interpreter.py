@@ -34,7 +34,8 @@ def join_inputs(
     """Build the input X of section 2.4 from the last interaction with the environment.
 
     The order is observation, previous action, previous reward, previous done flag. Without ``program.interaction``,
-    X is the observation alone and the rest is ignored.
+    X is the observation alone and the rest is ignored. Rewards and Box actions are rounded to ``float32``, as they are
+    in training.
 
     :param program: the program that will read X
     :param observation: ``(n_envs, n_observations)``, or ``(n_observations,)`` for one environment
@@ -57,11 +58,11 @@ def join_inputs(
     inputs[:, : program.n_observations] = observations
     if previous_action is not None:
         actions = _check_actions(program.action, previous_action, n_envs)
-        inputs[:, program.n_observations : -2] = encode_actions(actions, program.action, np.float64)
+        inputs[:, program.n_observations : -2] = encode_actions(actions, program.action)
     for column, name, value in ((-2, "previous_reward", previous_reward), (-1, "previous_done", previous_done)):
         if np.shape(value) not in ((), (n_envs,)):
             raise ValueError(f"{name} has the shape {np.shape(value)}; ({n_envs},) or one value is accepted")
-        inputs[:, column] = np.asarray(value, dtype=np.float64)
+        inputs[:, column] = np.asarray(value, dtype=np.float32)
     return inputs
 
 

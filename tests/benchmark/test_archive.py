@@ -53,13 +53,15 @@ def test_what_two_machines_did_apart_comes_together(tmp_path, capsys):
     archive = str(tmp_path / "b.json.gz")
     assert run(["benchmark", "export", stores[1], "--archive", archive]) == 0
     assert run(["benchmark", "import", archive, "--store", stores[0]]) == 0
-    assert "1 cells taken over, 0 known already" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "1 cells taken over, 0 known already" in said.out
+    assert "in no table" not in said.err
     rows, _, statuses = state(stores[0])
     assert [(row["seed"], row["steps_mean"]) for row in rows] == [(0, 63.0), (1, 70.0)]
     assert set(statuses.values()) == {"done"}
 
 
-def test_results_of_another_configuration_do_not_change_the_suite(tmp_path):
+def test_results_of_another_configuration_do_not_change_the_suite(tmp_path, capsys):
     old = parse_suite({**SMALL, "episodes": 2})
     archive, store = tmp_path / "old.json.gz", str(tmp_path / "now.db")
     with open_store(str(tmp_path / "old.db")) as opened:
@@ -70,7 +72,11 @@ def test_results_of_another_configuration_do_not_change_the_suite(tmp_path):
     before = state(store)
     with open_store(store) as opened:
         assert read_archive(opened, archive) == (1, 0)
+        assert opened.n_outside() == len(old.cells)
     assert state(store) == before
+    capsys.readouterr()
+    assert run(["benchmark", "import", str(archive), "--store", store]) == 0
+    assert f"{len(old.cells)} of all cells here are of seeds or settings" in capsys.readouterr().err
 
 
 def packed(document):

@@ -13,10 +13,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_progpolicy.programs import (
+    Condition,
+    Controller,
+    IfThenElse,
+    Program,
     ProgramRunner,
     export_python,
     join_inputs,
 )
+from sb3_progpolicy.spaces import ActionSpec
 from tests.programs.samples import program_by_hand, with_hostile_names
 from tests.programs.strategies import CELLS, build_program, hanoi_program, programs, random_actions, seeds, sparse
 
@@ -155,3 +160,18 @@ def test_exported_python_refuses_inputs_that_do_not_fit():
     for action in (6, -1):
         with pytest.raises(ValueError, match="previous_action"):
             policy.act([0.0] * 9, action, 0.0, False)
+
+
+def test_rewards_and_actions_are_read_as_in_training():
+    """0.7 and -0.01 are other numbers in ``float32``; a threshold at them tells the two apart."""
+    spec = ActionSpec("box", (1,), low=(-1.0,), high=(1.0,))
+    names = ("x", "[previous a]", "[reward]", "[done]"), ("a",)
+    for weights, bias in (((0.0, 10.0, 0.0, 0.0), -7.0), ((0.0, 0.0, -1.0, 0.0), -0.01)):
+        condition = Condition("affine", (), (), (), (), weights, bias)
+        low, high = (Controller(((0.0,) * 4,), (value,)) for value in (-0.5, 0.7))
+        program = Program(IfThenElse(condition, low, high), 1, spec, True, *names)
+        policy, runner, action, taken = load_policy(export_python(program)), ProgramRunner(program), None, None
+        for _ in range(4):
+            action = policy.act([0.0], action, -0.01, False)
+            taken = runner.act(join_inputs(program, [0.0], taken, -0.01, False))
+            np.testing.assert_allclose([action, taken[0]], [[0.7], [0.7]], rtol=1e-6)

@@ -195,11 +195,18 @@ class _CPrinter(ProgramVisitor[list[str]]):
         if not self.program.interaction:
             return []
         action = self.program.action
-        lines = [f"double p[{action.history_size}] = {{0.0}}; /* the previous action */"]
+        lines = [
+            # GCC 12 leaves out a conversion to float and back in a loop that it turns into vectors.
+            "volatile float rounded = (float)reward; /* as in training */",
+            "reward = (double)rounded;",
+            f"double p[{action.history_size}] = {{0.0}}; /* the previous action */",
+        ]
         if action.kind in ("box", "multi_binary"):
             lines += [
-                "if (previous_action)",
-                f"    for (int k = 0; k < {action.n_outputs}; k++) p[k] = (double)previous_action[k];",
+                f"for (int k = 0; previous_action && k < {action.n_outputs}; k++) {{",
+                "    rounded = (float)previous_action[k];",
+                "    p[k] = (double)rounded;",
+                "}",
             ]
         else:
             lines += ["if (previous_action) {"]

@@ -60,7 +60,8 @@ class ProgramPolicy {
       throw new RangeError(`observation holds ${inputs.length} numbers; ${nObservations} are accepted`);
     }
     if (interaction) {
-      inputs.push(...encodeAction(action, previousAction), Number(previousReward), Number(previousDone));
+      // Rewards and actions are rounded as they are in training.
+      inputs.push(...encodeAction(action, previousAction), Math.fround(previousReward), Number(previousDone));
     }
     if (!inputs.every(Number.isFinite)) {
       throw new RangeError("inputs hold a number that is infinite or not a number; finite numbers are accepted");
@@ -140,7 +141,7 @@ function encodeAction({ kind, sizes, start }, action) {
   if (parts.length !== expected) {
     throw new RangeError(`previousAction holds ${parts.length} numbers; ${expected} are accepted`);
   }
-  if (kind === "box" || kind === "multi_binary") return parts.map(Number);
+  if (kind === "box" || kind === "multi_binary") return parts.map(Math.fround);
   return parts.flatMap((part, i) => {
     const index = Number(part) - start;
     if (!Number.isInteger(index) || index < 0 || index >= sizes[i]) {

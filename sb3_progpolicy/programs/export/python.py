@@ -29,6 +29,15 @@ from sb3_progpolicy.programs.syntax import Condition, Controller, IfThenElse, Pr
 
 FEW_TERMS = 6  # a program none of whose sums has more is written as a person would write it
 # Python looks for a file's encoding in its first two lines. With this one first, no text of a program can set it.
+# Of the exported class. Numbers too small for it stay as they are.
+_FLOAT32 = (
+    "    @staticmethod",
+    "    def _float32(value):",
+    '        """Round to 24 bits, as rewards and actions are in training."""',
+    "        mantissa, exponent = frexp(value)",
+    "        return ldexp(round(ldexp(mantissa, 24)), exponent - 24)",
+    "",
+)
 _CODING = "# -*- coding: utf-8 -*-"
 
 
@@ -130,13 +139,22 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
             "#     policy = ProgramPolicy()",
             "#     action = policy.act(observation, None, 0.0, False)      # the first step",
             "#     action = policy.act(observation, action, reward, done)  # every later step",
-            *(
-                ["", "from math import tanh"]
-                if any(c.remembers and c.cell != "switch" for c in self.program.conditions)
-                else []
-            ),
+            *self._imports(),
             "",
         ]
+
+    def _imports(self) -> list[str]:
+        names = ["frexp", "ldexp"] if self._rounds else []
+        if any(c.remembers and c.cell != "switch" for c in self.program.conditions):
+            names.append("tanh")
+        return ["", f"from math import {', '.join(names)}"] if names else []
+
+    @property
+    def _rounds(self) -> bool:
+        """Whether a previous reward or action that is not whole is read, which training rounds to 24 bits."""
+        program = self.program
+        history = not self.by_hand or any(self.used[program.n_observations : -2])
+        return program.interaction and bool(self.used[-2] or (program.action.kind == "box" and history))
 
     def _class(self) -> list[str]:
         program, states = self.program, self._states()
@@ -158,6 +176,7 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
             '        """Forget everything. Call it when the task changes, not when an episode ends."""',
             *(f"        {line}" for line in reset),
             "",
+            *(_FLOAT32 if self._rounds else ()),
             "    def act(self, observation, previous_action=None, previous_reward=0.0, previous_done=False):",
             f'        """Choose an action: {self._action_words()}.',
             "",
@@ -205,7 +224,7 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
         if not program.interaction:
             return lines
         lines += self._read_history() if not self.by_hand or any(self.used[n:-2]) else []
-        lines += ["reward = float(previous_reward)"] * self.used[-2]
+        lines += ["reward = self._float32(previous_reward)"] * self.used[-2]
         return [*lines, *["done = float(previous_done)"] * self.used[-1]]
 
     def _read_history(self) -> list[str]:
@@ -224,11 +243,13 @@ class _PythonPrinter(ProgramVisitor[list[str]]):
                 lines += index_statements(f"action_{part}", f"given_{part}", 0, size)
         elif not self.by_hand:
             zeros = f"[0.0] * {len(self.history)} if previous_action is None else previous_action"
-            return [*lines, *unpack(self.history, f"map(float, {zeros})")]
+            rounded = "self._float32" if action.kind == "box" else "float"
+            return [*lines, *unpack(self.history, f"map({rounded}, {zeros})")]
         if not self.by_hand:
             return lines
+        rounded = "self._float32" if action.kind == "box" else "float"
         sources = [
-            f"0.0 if previous_action is None else float(previous_action[{k}])" for k in range(action.history_size)
+            f"0.0 if previous_action is None else {rounded}(previous_action[{k}])" for k in range(action.history_size)
         ]
         if self.one_hot:
             single = action.kind == "discrete"

@@ -14,7 +14,7 @@ TERMS_PER_STATEMENT = 50  # Python's parser and compiler limit how long a sum ma
 _MAX_IDENTIFIER = 40
 # Names that the written method uses itself, and Python's own.
 _TAKEN = {"self", "observation", "previous_action", "previous_reward", "previous_done", "reward", "done", "action"}
-_TAKEN |= {"scores", "tanh", "float", "int", "len", "max", "min", "map", *keyword.kwlist}
+_TAKEN |= {"scores", "tanh", "frexp", "ldexp", "float", "int", "len", "max", "min", "map", *keyword.kwlist}
 # The local variables of the written method: one of these letters or words, then numbers.
 _OURS = re.compile(r"((new_)?[bhcrznifgoupm]|on|off|scores|given|action)(_?[0-9])+")
 
