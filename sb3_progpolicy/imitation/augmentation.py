@@ -71,6 +71,8 @@ _MOST_BEGUN, _MOST_BELOW = 5, 4  # blocks of a tower; of those over which the gr
 def begun_towers(env: Any, seed: int, variation: Mapping[str, Any]) -> Observations:
     """Begin an episode of PandaStack, in half of the cases with a tower of one to five other blocks.
 
+    Taller ones come more often (the height is the larger of two that are drawn): what a program gets wrong over them
+    hardly shows over others.
     The hand is then at its neutral place or, in half of these cases and over towers of five, where it has just put the
     last block down. There are never more blocks than the environment can have.
 
@@ -84,7 +86,7 @@ def begun_towers(env: Any, seed: int, variation: Mapping[str, Any]) -> Observati
     rng = np.random.default_rng((seed, 1))
     n_objects = variation.get("n_objects", 1)
     most = max(min(_MOST_BEGUN, env.unwrapped.variations["n_objects"].high - n_objects), 0)
-    n_done = 0 if rng.random() < 0.5 else int(rng.integers(min(most, 1), most + 1))
+    n_done = 0 if rng.random() < 0.5 else int(rng.integers(min(most, 1), most + 1, size=2).max())
     above = n_done > 0 and (n_done > _MOST_BELOW or rng.random() < 0.5)
     options = {**variation, "n_objects": n_objects + n_done, "n_done": n_done if above else 0}
     observation = env.reset(seed=seed, options=options)[0]

@@ -87,7 +87,8 @@ class Learner:
             if present.n_branches < most:
                 present = grow(self.loss, self._some(data, _FEW), most, self.rng, present, tries=8)
             candidates.append(self._polished(present, data, 0.1))
-        if self.raw is None or number % _REFIT_EVERY == 0:
+        # Where plain lists are what is asked for, dense ones do nothing but visit states.
+        if self.raw is None or (number % _REFIT_EVERY == 0 and self.settings.max_sums == 1):
             candidates += [self._polished(program, data, 0.3) for program in self._fresh(data, most)]
         return self._chosen(candidates, data, scaler)
 
