@@ -155,6 +155,8 @@ def _evaluate(cell: Cell, model: BaseAlgorithm) -> list[dict[str, Any]]:
             env_kwargs=config.env_kwargs,
         )
         for result in results:
+            if result.success_rate is None:
+                raise ValueError(f"{config.env} reports no is_success at the end of an episode, which a suite counts")
             row = result.to_json()
             for column in ("env", "return_mean", "return_std"):
                 del row[column]

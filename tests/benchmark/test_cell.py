@@ -1,13 +1,17 @@
 """What a cell trains on and returns."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 
 from progpolicy_envs import DOMAINS
-from sb3_progpolicy.benchmark.cell import run_cell, trained_variations
+from sb3_progpolicy.benchmark import cell as cells
+from sb3_progpolicy.benchmark.cell import run_cell
 from sb3_progpolicy.benchmark.suite import parse_suite
+from sb3_progpolicy.evaluation import evaluate_any
+from sb3_progpolicy.experiment.run import trained_variations
 from tests.benchmark.small import SMALL
 
 
@@ -33,6 +37,16 @@ def test_cell_has_a_row_for_each_variation_and_semantics(tmp_path):
     assert (result.timesteps, result.capped) == (4096, False)
     again = run_cell(suite.cells[0], tmp_path)
     assert (again.rows, again.curve) == (result.rows, result.curve), "trained already: evaluated again"
+
+
+def test_an_environment_without_a_goal_is_refused_by_name(tmp_path, monkeypatch):
+    def without_goal(*arguments, **options):
+        return [dataclasses.replace(row, success_rate=None) for row in evaluate_any(*arguments, **options)]
+
+    monkeypatch.setattr(cells, "evaluate_any", without_goal)
+    suite = parse_suite({**SMALL, "methods": {"reptile_ppo": {"n_timesteps": 64}}, "seeds": [0]})
+    with pytest.raises(ValueError, match="Hanoi-v0 reports no is_success at the end of an episode"):
+        run_cell(suite.cells[0], tmp_path)
 
 
 def test_limit_on_processor_time_ends_training_and_is_noted(tmp_path):

@@ -167,14 +167,13 @@ class _Graph:
 
     def _taken(self, values: Sequence[str], weights: str, outputs: str) -> str:
         """The outputs that decide, ``(n_envs, n_outputs)``: of the controller reached, or the mixture's."""
-        axis = self._constant([1], np.int64)
         if self.soft:
             if self.program.action.kind == "box" and self.program.semantics == "branches":
                 likeliest = self._node("ArgMax", weights, axis=1, keepdims=0)
                 weights = self._node("Gather", self._constant(np.eye(len(values) + 1)), likeliest, axis=0)
             column = self._node("Unsqueeze", weights, self._constant([2], np.int64))
             mixed = self._node("Mul", column, self._distribution(outputs))
-            return self._node("ReduceSum", mixed, axis, keepdims=0)
+            return self._node("ReduceSum", mixed, self._constant([1], np.int64), keepdims=0)
         parts = [
             self._node("Gather", outputs, self._constant(index, np.int64), axis=1) for index in range(len(values) + 1)
         ]
