@@ -9,7 +9,6 @@ from itertools import groupby
 from typing import Any, cast
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_wrapper
@@ -23,6 +22,7 @@ from sb3_progpolicy.programs.interpreter import ProgramRunner, Semantics, join_i
 from sb3_progpolicy.programs.syntax import ProgramData
 from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, refuse_unread
 from sb3_progpolicy.spaces import action_spec, interaction_space, shaped
+from sb3_progpolicy.surroundings import check_fit, own_env_kwargs, refuse_wrappers
 from sb3_progpolicy.vec_env import BatchedVecEnv, make_fast_vec_env
 from sb3_progpolicy.vec_env.repeat import repeat_options
 
@@ -198,55 +198,6 @@ def evaluate_any(
 def _alike(one: Any, other: Any) -> bool:
     """Return whether two action spaces are described alike, whatever their classes."""
     return one == other or (isinstance(one, type(other)) and action_spec(one) == action_spec(other))
-
-
-def _mapping(name: str, value: Any) -> Mapping[str, Any]:
-    if not isinstance(value, Mapping):
-        raise ValueError(f"{name}={value!r} is not accepted; it is a mapping")
-    return value
-
-
-def own_env_kwargs(program: ProgramData, env_id: str | None = None) -> dict[str, Any]:
-    """Return the constructor arguments of the environment that a program was trained in, as its metadata say.
-
-    :param program: the program
-    :param env_id: where it is to act; there are none for another environment than its own
-    :raises ValueError: if the metadata hold something else
-    """
-    if env_id not in (None, id_from_file(program.metadata.get("env"))):
-        return {}
-    return dict(_mapping("the program's env_kwargs", program.metadata.get("env_kwargs", {})))
-
-
-def check_fit(
-    program: ProgramData, env_id: str | None, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
-) -> None:
-    """Raise ``ValueError`` if a program does not read the observations of an environment, or acts otherwise.
-
-    :param program: the program
-    :param env_id: of the environment
-    :param observation_space: of one environment
-    :param action_space: of one environment
-    """
-    spec, n_observations = action_spec(action_space), int(np.prod(observation_space.shape or ()))
-    if (spec, n_observations) != (program.action, program.n_observations):
-        raise ValueError(
-            f"the program reads {program.n_observations} numbers and acts in {program.action.kind} "
-            f"{list(program.action.sizes)}; {env_id} has {n_observations} numbers and {spec.kind} {list(spec.sizes)}"
-        )
-
-
-def refuse_wrappers(what: str, wrappers: Sequence[str]) -> None:
-    """Raise ``ValueError`` if something was trained in wrappers that an environment's id does not bring back.
-
-    :param what: was trained, for the message
-    :param wrappers: see :func:`~sb3_progpolicy.extraction.wrappers_of`
-    """
-    if wrappers:
-        raise ValueError(
-            f"{what} was trained in an environment wrapped in {', '.join(wrappers)}, which an id alone does not bring "
-            "back. Evaluate it in that environment, as with SB3's evaluate_policy(model, model.get_env())"
-        )
 
 
 def _normalized(venv: VecEnv, normalizer: VecNormalize) -> VecNormalize:

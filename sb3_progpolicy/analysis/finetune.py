@@ -11,13 +11,13 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_progpolicy.analysis.rollout import surroundings
 from sb3_progpolicy.analysis.terms import Floats, symmetric_part
 from sb3_progpolicy.hyperparams import load_hyperparams
 from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.programs.syntax import Condition, Controller, Expression, IfThenElse, ProgramData
 from sb3_progpolicy.reptile_ppo.algorithm import ReptilePPO
 from sb3_progpolicy.reptile_ppo.initial import read_initial_program
+from sb3_progpolicy.surroundings import surroundings
 
 #: Share of the steps in which the critic alone learns: before it knows what the program is worth, PPO would ruin it.
 CRITIC_FIRST = 0.25

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from progpolicy_envs import find_domain
-from sb3_progpolicy.analysis.rollout import make_batch, surroundings
+from sb3_progpolicy.analysis.rollout import make_batch
 from sb3_progpolicy.analysis.simplify import Simplification, simplify
 from sb3_progpolicy.programs.syntax import ProgramData
+from sb3_progpolicy.surroundings import surroundings
 
 #: Starts of all training variations, at most: these few are gone through before a program is shown.
 MAX_STARTS = 1000

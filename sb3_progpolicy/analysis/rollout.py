@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,12 +10,10 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from progpolicy_envs import find_domain
 from progpolicy_envs.vector import PlanningVectorEnv
-from sb3_progpolicy.env_ids import spec_of
-from sb3_progpolicy.evaluation import check_fit, own_env_kwargs
 from sb3_progpolicy.programs.interpreter import ProgramRunner, join_inputs
 from sb3_progpolicy.programs.syntax import ProgramData
+from sb3_progpolicy.surroundings import check_fit, surroundings
 
 
 @dataclass(frozen=True)
@@ -57,33 +55,6 @@ def make_batch(program: ProgramData, env_id: str, n_envs: int) -> PlanningVector
         raise ValueError(f"{env_id} is not accepted; the planning domains have starts that can be chosen")
     check_fit(program, env_id, venv.single_observation_space, venv.single_action_space)
     return venv
-
-
-@dataclass(frozen=True)
-class Surroundings:
-    """How the environment is made that a program was trained in.
-
-    :param variation: parameters of its domain that are not the defaults
-    :param kwargs: other arguments of its constructor
-    :param cap: steps after which an episode has failed; ``None`` if there is no limit
-    """
-
-    variation: Mapping[str, Any]
-    kwargs: Mapping[str, Any]
-    cap: int | None
-
-
-def surroundings(program: ProgramData, env_id: str) -> Surroundings:
-    """Return how an environment is to be made: as the program's own if it is that one, else by the defaults.
-
-    :param program: what will act in it
-    :param env_id: environment id
-    """
-    kwargs, domain = own_env_kwargs(program, env_id), find_domain(env_id)
-    cap = kwargs.pop("max_episode_steps", spec_of(env_id).max_episode_steps)
-    names = set() if domain is None or domain.space is None else set(domain.space.defaults)
-    variation = {name: kwargs.pop(name) for name in list(kwargs) if name in names}
-    return Surroundings(variation, kwargs, cap)
 
 
 def run_episodes(

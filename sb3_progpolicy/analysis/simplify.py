@@ -17,12 +17,12 @@ from sb3_progpolicy.analysis.prune import Point, Pruned, prune
 from sb3_progpolicy.analysis.rules import Rules, count_numbers
 from sb3_progpolicy.analysis.situations import Situations, meet, meet_in
 from sb3_progpolicy.analysis.switches import disagreements, replace_switches
-from sb3_progpolicy.evaluation import refuse_wrappers
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.programs.interpreter import ProgramRunner
 from sb3_progpolicy.programs.io import program_digest
 from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.programs.syntax import ProgramData
+from sb3_progpolicy.surroundings import refuse_wrappers
 
 EquallyGood = Literal["program", "planner", "outcome"]
 _CHOICES = ("program", "planner", "outcome")

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progpolicy_envs.vector import PlanningVectorEnv
-from sb3_progpolicy.analysis.rollout import Step, batches, make_batch, run_episodes, start_numbers, surroundings
+from sb3_progpolicy.analysis.rollout import Step, batches, make_batch, run_episodes, start_numbers
 from sb3_progpolicy.programs.interpreter import ProgramRunner
 from sb3_progpolicy.programs.syntax import ProgramData
+from sb3_progpolicy.surroundings import surroundings
 
 BATCH = 512
 

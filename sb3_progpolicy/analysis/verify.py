@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from progpolicy_envs import find_domain
 from sb3_progpolicy.analysis.checkpoint import Checkpoint
-from sb3_progpolicy.analysis.rollout import make_batch, run_episodes, start_numbers, surroundings
+from sb3_progpolicy.analysis.rollout import make_batch, run_episodes, start_numbers
 from sb3_progpolicy.env_ids import spec_of
-from sb3_progpolicy.evaluation import check_fit, own_env_kwargs, refuse_wrappers
 from sb3_progpolicy.programs.interpreter import ProgramRunner, join_inputs
 from sb3_progpolicy.programs.io import program_digest
 from sb3_progpolicy.programs.syntax import ProgramData
 from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, refuse_unread
 from sb3_progpolicy.spaces import shaped
+from sb3_progpolicy.surroundings import check_fit, own_env_kwargs, refuse_wrappers, surroundings
 
 #: Numbers of starts: all of them, or those drawn.
 Numbers = range | NDArray[np.int64]

@@ -47,8 +47,8 @@ def verify(
     certificate, an interrupted run goes on when it is started again.
     """
     from sb3_progpolicy.analysis.verify import certificate
-    from sb3_progpolicy.evaluation import own_env_kwargs
     from sb3_progpolicy.programs.files import write_atomically
+    from sb3_progpolicy.surroundings import own_env_kwargs
 
     if output is not None:
         check_folder(output)

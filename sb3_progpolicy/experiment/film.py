@@ -96,9 +96,9 @@ Act = Callable[[Any, float, bool], Any]
 def _policy(source: Source, semantics: Any, env: Any) -> Act:
     if source.program is None:
         raise ValueError(f"{source.name} is not a program; render plays programs, planners and random actions")
-    from sb3_progpolicy.evaluation import refuse_wrappers
     from sb3_progpolicy.programs.interpreter import ProgramRunner, join_inputs
     from sb3_progpolicy.spaces import shaped
+    from sb3_progpolicy.surroundings import refuse_wrappers
 
     refuse_wrappers("the program", source.program.metadata.get("wrappers", ()))
     program, previous = source.program, None

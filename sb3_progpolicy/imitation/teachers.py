@@ -212,8 +212,8 @@ class ModelTeacher:
     """
 
     def __init__(self, model: BaseAlgorithm, observation_space: Any, spec: ActionSpec) -> None:
-        from sb3_progpolicy.evaluation import refuse_wrappers
         from sb3_progpolicy.extraction import wrappers_of
+        from sb3_progpolicy.surroundings import refuse_wrappers
 
         env = model.get_env()
         refuse_wrappers("the teacher", getattr(model, "wrappers", ()) if env is None else wrappers_of(env))

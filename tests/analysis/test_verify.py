@@ -9,12 +9,12 @@ import pytest
 
 from progpolicy_envs import DOMAINS
 from sb3_progpolicy import ReptilePPO, evaluate_program, load_pretrained
-from sb3_progpolicy.analysis.rollout import surroundings
 from sb3_progpolicy.analysis.simplify import simplify
 from sb3_progpolicy.analysis.verify import success_bound, verify
 from sb3_progpolicy.cli import run
 from sb3_progpolicy.programs import ProgramRunner, join_inputs
 from sb3_progpolicy.programs.io import program_digest
+from sb3_progpolicy.surroundings import surroundings
 from tests.analysis.idle import idle
 
 
