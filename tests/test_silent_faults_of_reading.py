@@ -16,6 +16,8 @@ def test_a_file_that_is_read_is_not_overwritten(tmp_path, capsys):
             ["show", str(program), "--format", "python", "--set", "n_discs=3"],
             "--set and --seed are for --format activity",
         ),
+        (["render", "Hanoi-v0", "--random", "--semantics", "soft", "-o", "a.gif"], "--semantics is for programs"),
+        (["simplify", str(program), "--curve", "nowhere/c.csv"], "--curve 'nowhere/c.csv' is not accepted"),
         (["evaluate", "Hanoi-v0", "--set", "n_discs=5", "--set", "n_discs=6"], "n_discs is given twice"),
         (
             ["simplify", str(program), "--curve", str(tmp_path / "c.csv"), "-o", str(tmp_path / "s.json")],

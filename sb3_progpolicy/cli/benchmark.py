@@ -102,9 +102,9 @@ def export(
         raise ValueError("--json and --csv are not accepted together")
     if archive is not None and (as_json or csv or curves or output):
         raise ValueError("--archive is not accepted together with --json, --csv, --curves or --output")
-    for path in (output, archive):
+    for path, option in ((output, "-o"), (archive, "--archive")):
         if path is not None:
-            check_folder(path)
+            check_folder(path, option)
     with open_store(store, create=False) as opened:
         if archive is not None:
             write_archive(opened, suite, archive)

@@ -97,14 +97,15 @@ def _expand(pair: str, item: str) -> Sequence[Any]:
     return range(low, high + 1)
 
 
-def check_folder(output: Path) -> None:
+def check_folder(output: Path, option: str = "-o") -> None:
     """Find out before the work that a file cannot be written.
 
     :param output: the file
+    :param option: that gives it
     :raises ValueError: if its folder does not exist
     """
     if not output.parent.is_dir():
-        raise ValueError(f"-o {str(output)!r} is not accepted; the folder {str(output.parent)!r} does not exist")
+        raise ValueError(f"{option} {str(output)!r} is not accepted; the folder {str(output.parent)!r} does not exist")
 
 
 def default_variations(env_id: str) -> list[dict[str, Any]]:

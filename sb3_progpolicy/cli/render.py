@@ -37,6 +37,8 @@ def render(
         raise ValueError("--planner and --random are not accepted together")
     if semantics not in ("crisp", "soft"):
         raise unknown("semantics", semantics, ("crisp", "soft"))
+    if semantics == "soft" and (planner or random):
+        raise ValueError("--semantics is for programs; neither a planner nor drawn actions have one")
     with quiet_stdout():
         actor = "planner" if planner else "random" if random else "policy"
         source = find_source(run_or_name, allow_pickle) if actor == "policy" else environment_of(run_or_name)

@@ -62,7 +62,7 @@ def simplify(
         if output.suffix.lower() != ".json":
             raise ValueError(f"-o {str(output)!r} is not accepted; the file is a .json")
     if curve is not None:
-        check_folder(curve)
+        check_folder(curve, "--curve")
         if curve.suffix.lower() not in (".csv", ".png"):
             raise ValueError(f"--curve {str(curve)!r} is not accepted; the file is a .csv or a .png")
         if curve.suffix.lower() == ".png" and importlib.util.find_spec("matplotlib") is None:
