@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 ActionKind = Literal["discrete", "box", "multi_discrete", "multi_binary"]
 
@@ -111,18 +111,17 @@ def shaped(actions: NDArray[Any], space: spaces.Space[Any] | None) -> NDArray[An
     return actions.reshape(len(actions), *space.shape) if isinstance(space, spaces.Box) else actions
 
 
-def encode_actions(actions: NDArray[Any], spec: ActionSpec, dtype: DTypeLike = np.float32) -> NDArray[Any]:
+def encode_actions(actions: NDArray[Any], spec: ActionSpec) -> NDArray[np.float32]:
     """Encode actions for X: one-hot for Discrete and MultiDiscrete, the numbers themselves otherwise.
 
     :param actions: ``(n_envs, *action_shape)``, each in the action space
     :param spec: the action space
-    :param dtype: of the result
     :return: ``(n_envs, spec.history_size)``
     """
     n_envs = len(actions)
     if spec.kind in ("box", "multi_binary"):
-        return actions.reshape(n_envs, -1).astype(dtype)
-    encoded = np.zeros((n_envs, spec.history_size), dtype=dtype)
+        return actions.reshape(n_envs, -1).astype(np.float32)
+    encoded = np.zeros((n_envs, spec.history_size), dtype=np.float32)
     columns = actions.reshape(n_envs, -1) - spec.start
     if len(spec.sizes) > 1:
         columns = columns + np.concatenate(([0], np.cumsum(spec.sizes)[:-1]))

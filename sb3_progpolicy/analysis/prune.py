@@ -232,10 +232,6 @@ def prune(
     return _finetuned(pruned, partial(train, symmetries=tying), finetune_for, measure, good_enough)
 
 
-def _as_good(point: Point, good_enough: GoodEnough) -> tuple[bool, float]:
-    return good_enough(point.success_rate, point.steps_mean), point.success_rate
-
-
 class _Found(NamedTuple):
     point: Point
     curve: tuple[Point, ...]
@@ -259,8 +255,11 @@ def _by_path(
         )
         if n_terms is not None:
             # Several may have so many terms: those that were added one by one, and others of which some were left out.
-            points = [point for point in curve if point.terms == n_terms]
-            best = max(points, key=lambda point: (*_as_good(point, good_enough), -point.steps_mean), default=None)
+            best = max(
+                (point for point in curve if point.terms == n_terms),
+                key=lambda one: (good_enough(one.success_rate, one.steps_mean), one.success_rate, -one.steps_mean),
+                default=None,
+            )
             if best is None:
                 known = ", ".join(str(point.terms) for point in curve)
                 raise ValueError(f"n_terms={n_terms} is not accepted; there are programs of {known} terms")

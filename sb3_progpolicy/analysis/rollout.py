@@ -85,7 +85,7 @@ def run_episodes(
         if not active.any():
             break
         # The done flag is 0 within an episode; environments that have reached the goal go on unseen.
-        inputs = join_inputs(program, observations, previous, rewards.astype(np.float32), none_ended)
+        inputs = join_inputs(program, observations, previous, rewards, none_ended)
         previous = runner.act(inputs)
         if visit is not None:
             visit(Step(inputs, previous, runner.branch, active, venv))

@@ -20,7 +20,7 @@ from sb3_progpolicy.env_ids import spec_of
 from sb3_progpolicy.programs.interpreter import ProgramRunner, join_inputs
 from sb3_progpolicy.programs.io import program_digest
 from sb3_progpolicy.programs.syntax import ProgramData
-from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, refuse_unread
+from sb3_progpolicy.reptile.options import ReadOptions, refuse_unread, split_variation
 from sb3_progpolicy.spaces import shaped
 from sb3_progpolicy.surroundings import check_fit, own_env_kwargs, refuse_wrappers, surroundings
 
@@ -123,8 +123,8 @@ def verify(
         **given,
         "seed": seed,
     }
-    if around.kwargs or around.variation:
-        origin["env_kwargs"] = own_env_kwargs(program, env_id)
+    if own := own_env_kwargs(program, env_id):
+        origin["env_kwargs"] = own
     kept = Checkpoint(None if checkpoint is None else Path(checkpoint), origin)
     rows = [Verification(**row) for row in kept.rows]
     for place, variation in enumerate(listed):
@@ -178,14 +178,14 @@ def _counted(
 ) -> Verification:
     tally = _Tally()
     vars(tally).update(kept.counts)
-    venv = make_batch(program, env_id, min(BATCH, len(numbers)))
+    venv, registered = make_batch(program, env_id, min(BATCH, len(numbers))), surroundings(program, env_id).cap or 0
     for first in range(tally.starts, len(numbers), BATCH):
         part = np.asarray(numbers[first : first + BATCH], dtype=np.int64)
         if len(part) != venv.num_envs:
             venv = make_batch(program, env_id, len(part))
         observations = venv.reset_to(variation, part, any_state)
         optimal = venv.optimal_steps()
-        cap = max_steps or max(surroundings(program, env_id).cap or 0, 2 * int(optimal.max()))
+        cap = max_steps or max(registered, 2 * int(optimal.max()))
         steps = run_episodes(program, venv, observations, optimal, cap)
         shortest = tally.add(steps, optimal.astype(np.float64))
         if shortest is not None:
@@ -212,9 +212,7 @@ def _sampled(
     cap = around.cap if max_steps is None else max_steps
     if cap is None:
         raise ValueError(f"{env_id} has no cap on the steps of an episode; give max_steps")
-    made = set() if find_domain(env_id) else constructor_arguments(env_id, variation, around.kwargs)
-    fixed = {name: value for name, value in variation.items() if name in made}
-    options = {name: value for name, value in variation.items() if name not in made}
+    fixed, options = split_variation(env_id, variation, around.kwargs)
     tally = _Tally()
     env = gym.make(spec.id, **{**around.kwargs, **fixed, "max_episode_steps": cap})
     try:
@@ -241,7 +239,7 @@ def _steps_to_goal(program: ProgramData, env: gym.Env[Any, Any], env_id: str, ob
     runner, previous, reward, step = ProgramRunner(program), None, 0.0, 0
     while True:
         flat = np.asarray(observation, dtype=np.float64).reshape(1, -1)
-        previous = runner.act(join_inputs(program, flat, previous, np.float32(reward), False))
+        previous = runner.act(join_inputs(program, flat, previous, reward, False))
         action = shaped(previous, env.action_space)[0]
         observation, reward, terminated, truncated, info = env.step(action)  # type: ignore[assignment]
         step += 1

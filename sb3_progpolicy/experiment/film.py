@@ -42,9 +42,8 @@ def record(
     """
     import gymnasium as gym
 
-    from progpolicy_envs import find_domain
     from sb3_progpolicy.env_ids import spec_of
-    from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, refuse_unread
+    from sb3_progpolicy.reptile.options import ReadOptions, refuse_unread, split_variation
 
     if output.suffix.lower() not in FORMATS:
         raise ValueError(f"-o {str(output)!r} is not accepted; the file is a .gif or an .mp4")
@@ -56,11 +55,10 @@ def record(
     if cap is None:
         raise ValueError(f"{source.env_id} has no cap on steps; give --max-steps")
     kwargs = {name: value for name, value in source.env_kwargs.items() if name != "max_episode_steps"}
-    fixed = set() if find_domain(source.env_id) else constructor_arguments(source.env_id, variation, kwargs)
-    kwargs |= {name: variation[name] for name in fixed}
-    env = gym.make(source.env_id, render_mode="rgb_array", max_episode_steps=cap, **kwargs)
+    fixed, given = split_variation(source.env_id, variation, kwargs)
+    env = gym.make(source.env_id, render_mode="rgb_array", max_episode_steps=cap, **{**kwargs, **fixed})
     try:
-        options = ReadOptions({name: value for name, value in variation.items() if name not in fixed})
+        options = ReadOptions(given)
         observation, info = env.reset(seed=seed, options=options)
         refuse_unread([options], source.env_id)
         env.action_space.seed(seed)

@@ -9,6 +9,8 @@ from typing import Any
 
 import gymnasium as gym
 
+from progpolicy_envs import find_domain
+
 
 class ReadOptions(dict[str, Any]):
     """Reset options that know which of them have been read.
@@ -77,6 +79,20 @@ def refuse_unread(options: Iterable[Any], env: str) -> None:
     """
     if unread := unread_names(options):
         raise ValueError(f"the reset option {', '.join(sorted(unread))} has no effect; {env} does not read it")
+
+
+def split_variation(
+    env_id: str, variation: Mapping[str, Any], env_kwargs: Mapping[str, Any]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the parts of a variation that are for the constructor and for resets.
+
+    :param env_id: a registered id; resets of this package's domains read all
+    :param variation: parameters and values
+    :param env_kwargs: constructor arguments of the environment that is tried
+    """
+    fixed = set() if find_domain(env_id) else constructor_arguments(env_id, variation, env_kwargs)
+    made = {name: value for name, value in variation.items() if name in fixed}
+    return made, {name: value for name, value in variation.items() if name not in fixed}
 
 
 def constructor_arguments(env_id: str, variation: Mapping[str, Any], env_kwargs: Mapping[str, Any]) -> set[str]:
