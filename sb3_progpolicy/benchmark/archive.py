@@ -6,6 +6,7 @@ import gzip
 import json
 import zlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +41,24 @@ def write_archive(store: Store, suite: str | None, path: Path) -> None:
     write_atomically(path, gzip.compress(content.encode(), mtime=0))
 
 
-def read_archive(store: Store, path: Path) -> tuple[int, int]:
-    """Take over results from a file. A cell that the store has a result of keeps it.
+@dataclass(frozen=True)
+class Archive:
+    """What a file of :func:`write_archive` holds.
 
-    :param store: to take them over into
+    :param suite: its cells
+    :param commands: that reproduce them, one each
+    :param results: of them, one each; ``None`` where there is none
+    """
+
+    suite: Suite
+    commands: list[str]
+    results: list[CellResult | None]
+
+
+def read_archive(path: Path) -> Archive:
+    """Read a file of :func:`write_archive` and check all of it.
+
     :param path: of the file
-    :return: how many results were new, and how many were known
     :raises ValueError: if it is not such a file
     """
     try:
@@ -61,11 +74,21 @@ def read_archive(store: Store, path: Path) -> tuple[int, int]:
         entries: list[Mapping[str, Any]] = described["cells"]
         suite = Suite(described["suite"], tuple(Cell.from_json(entry["cell"]) for entry in entries))
         results = [None if entry["result"] is None else CellResult(**entry["result"]) for entry in entries]
-        commands = [entry["command"] for entry in entries]
+        return Archive(suite, [entry["command"] for entry in entries], results)
     except FileNotFoundError:
         raise ValueError(f"{path} does not exist") from None
     except (OSError, EOFError, zlib.error, ValueError, TypeError, LookupError) as error:
         raise ValueError(f"{path} is not what 'benchmark export --archive' writes: {error}") from None
-    store.add(suite, commands, keep_members=True)
-    new = [store.finish(cell.key, result) for cell, result in zip(suite.cells, results, strict=True) if result]
+
+
+def take_over(store: Store, archive: Archive) -> tuple[int, int]:
+    """Take over results from an archive. A cell that the store has a result of keeps it.
+
+    :param store: to take them over into
+    :param archive: which has them
+    :return: how many results were new, and how many were known
+    """
+    store.add(archive.suite, archive.commands, keep_members=True)
+    pairs = zip(archive.suite.cells, archive.results, strict=True)
+    new = [store.finish(cell.key, result) for cell, result in pairs if result]
     return sum(new), len(new) - sum(new)

@@ -16,7 +16,6 @@ from scipy import stats
 
 #: Of a bootstrap; intervals hold 95 % of them.
 N_RESAMPLES, CONFIDENCE = 2000, 0.95
-DEFAULT_CAP = 500.0
 
 #: Scores of a method, ``(n_seeds,)`` for each task.
 Scores = Mapping[str, NDArray[np.float64]]
@@ -36,20 +35,21 @@ class Interval:
     high: float
 
 
-def score_of(row: Mapping[str, Any], cap: float = DEFAULT_CAP) -> float:
+def score_of(row: Mapping[str, Any]) -> float:
     """Return how good a result is, from 0, where no episode succeeds, to 1.
 
     The planner's steps over the steps taken, where a failed episode counts as the cap; or, where there is no planner,
-    the share of the cap that was not needed.
+    the share of the cap that was not needed; or, where there is no cap either, the share of successful episodes.
 
     :param row: of a store
-    :param cap: that failed episodes count as
     """
     if not row["success_rate"]:
         return 0.0
     if row["optimal_steps_mean"]:
         return min(1.0, float(row["optimal_steps_mean"] / row["steps_mean"]))
-    return max(0.0, 1 - row["steps_mean"] / cap)
+    if row["cap"] is None:
+        return float(row["success_rate"])
+    return max(0.0, 1 - row["steps_mean"] / row["cap"])
 
 
 def interquartile_mean(scores: Scores, seed: int = 0) -> Interval:

@@ -14,7 +14,7 @@ import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError, SQLAlchemyError
 
 from sb3_progpolicy.benchmark.cell import CellResult
-from sb3_progpolicy.benchmark.suite import Suite
+from sb3_progpolicy.benchmark.suite import Suite, cap_of
 
 #: Seconds without a sign of life after which a cell is taken from its runner.
 STALE = 180.0
@@ -76,15 +76,16 @@ class Store:
 
     def __init__(self, url: str, create: bool = True) -> None:
         if "://" not in url:
-            if not create and not os.path.isfile(url):
-                raise ValueError(f"{url} does not exist; a store is an SQLite file or a database URL")
             url = f"sqlite:///{url}"
         try:
             self.engine = sa.create_engine(url)
+            file = self.engine.url.database if self.engine.dialect.name == "sqlite" else None
+            if not create and file and not os.path.isfile(file):
+                raise ValueError(f"{file} does not exist; a store is an SQLite file or a database URL")
             if self.engine.dialect.name == "sqlite":
                 sa.event.listen(self.engine, "connect", _prepare_sqlite)
                 sa.event.listen(self.engine, "begin", lambda connection: connection.exec_driver_sql("BEGIN IMMEDIATE"))
-            self._make_tables()
+            self._make_tables() if create else self._check_tables(url)
         except ModuleNotFoundError as error:
             raise ValueError(f"{url} needs {error.name}, which is not installed") from None
         except (SQLAlchemyError, OSError) as error:
@@ -101,6 +102,11 @@ class Store:
                 if attempt == 2:
                     raise
                 time.sleep(0.2)
+
+    def _check_tables(self, url: str) -> None:
+        missing = set(_SCHEMA.tables) - set(sa.inspect(self.engine).get_table_names())
+        if missing:
+            raise ValueError(f"{url} is not a store: it has no table {', '.join(sorted(missing))}")
 
     def close(self) -> None:
         """Close all connections."""
@@ -347,6 +353,7 @@ def _exported(cell: dict[str, Any], row: dict[str, Any]) -> dict[str, Any]:
         "env": cell["env"],
         "seed": cell["seed"],
         **row,
+        "cap": cap_of(cell["cell"]),
         **{name: result[name] for name in ("timesteps", "capped", "processor_seconds", "wall_seconds", "commit")},
         "versions": " ".join(f"{name}={version}" for name, version in result["versions"].items()),
         "config": cell["key"],

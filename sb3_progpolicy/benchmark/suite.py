@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from progpolicy_envs import get_domain
+from sb3_progpolicy.env_ids import spec_of
 from sb3_progpolicy.experiment.config import MAX_SEED, RunConfig, make_config, parse_config
 from sb3_progpolicy.hyperparams import read_yaml, shortened
 from sb3_progpolicy.nearest import unknown
@@ -69,6 +70,15 @@ class Cell:
         :raises ValueError: if its configuration is not accepted
         """
         return cls(**{**described, "config": parse_config(described["config"])})
+
+
+def cap_of(described: Mapping[str, Any]) -> int | None:
+    """Return the most steps of an episode in a cell's evaluations; ``None`` where nothing caps them.
+
+    :param described: the cell, as :meth:`Cell.to_json` has it
+    """
+    registered: int | None = spec_of(described["config"]["env"]).max_episode_steps
+    return described["max_steps"] or registered
 
 
 @dataclass(frozen=True)

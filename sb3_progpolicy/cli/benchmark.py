@@ -123,11 +123,12 @@ def import_(
     archive: Annotated[Path, typer.Argument(help="file of 'benchmark export --archive'")], store: STORE = "results.db"
 ) -> None:
     """Take over the results of another store, such as another machine's; what this one has it keeps."""
-    from sb3_progpolicy.benchmark.archive import read_archive
+    from sb3_progpolicy.benchmark.archive import read_archive, take_over
     from sb3_progpolicy.benchmark.store import open_store
 
+    content = read_archive(archive)
     with open_store(store) as opened:
-        new, known = read_archive(opened, archive)
+        new, known = take_over(opened, content)
         outside = opened.n_outside()
     typer.echo(f"{new} cells taken over, {known} known already")
     if outside:

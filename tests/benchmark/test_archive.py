@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from sb3_progpolicy.benchmark.archive import read_archive, write_archive
+from sb3_progpolicy.benchmark.archive import read_archive, take_over, write_archive
 from sb3_progpolicy.benchmark.cell import CellResult
 from sb3_progpolicy.benchmark.store import open_store
 from sb3_progpolicy.benchmark.suite import parse_suite
@@ -38,8 +38,8 @@ def test_archive_holds_all_that_the_store_knows(url, tmp_path):
     with open_store(url) as store:
         write_archive(store, None, archive)
     with open_store(other) as store:
-        assert read_archive(store, archive) == (1, 0)
-        assert read_archive(store, archive) == (0, 1)
+        assert take_over(store, read_archive(archive)) == (1, 0)
+        assert take_over(store, read_archive(archive)) == (0, 1)
     assert state(other) == state(url)
     with open_store(other) as store:
         write_archive(store, "small", tmp_path / "again.json.gz")
@@ -71,7 +71,7 @@ def test_results_of_another_configuration_do_not_change_the_suite(tmp_path, caps
     fill(store, KEYS[:1])
     before = state(store)
     with open_store(store) as opened:
-        assert read_archive(opened, archive) == (1, 0)
+        assert take_over(opened, read_archive(archive)) == (1, 0)
         assert opened.n_outside() == len(old.cells)
     assert state(store) == before
     capsys.readouterr()
@@ -97,10 +97,12 @@ def packed(document):
 ])  # fmt: skip
 def test_other_files_are_refused(tmp_path, content, message):
     (tmp_path / "archive").write_bytes(content)
-    with open_store(str(tmp_path / "s.db")) as store, pytest.raises(ValueError, match=message):
-        read_archive(store, tmp_path / "archive")
+    with pytest.raises(ValueError, match=message):
+        read_archive(tmp_path / "archive")
 
 
-def test_missing_file_is_named(tmp_path):
-    with open_store(str(tmp_path / "s.db")) as store, pytest.raises(ValueError, match=r"nowhere\.gz does not exist"):
-        read_archive(store, tmp_path / "nowhere.gz")
+def test_missing_file_is_named_and_no_store_made(tmp_path, capsys):
+    store = tmp_path / "s.db"
+    assert run(["benchmark", "import", str(tmp_path / "nowhere.gz"), "--store", str(store)]) == 2
+    assert "nowhere.gz does not exist" in capsys.readouterr().err
+    assert not store.exists()

@@ -59,7 +59,9 @@ def test_score_is_the_planners_share_of_the_steps():
     assert score_of(row(steps=63.0)) == 1
     assert score_of(row(steps=126.0)) == 0.5
     assert score_of(row(steps=20.0, success=0.0)) == 0, "a cap below the optimum is no success"
-    assert score_of(row(steps=100.0, optimal_steps_mean=None)) == 0.8
+    assert score_of(row(steps=100.0, optimal_steps_mean=None, cap=500)) == 0.8
+    assert score_of(row(steps=100.0, optimal_steps_mean=None, cap=200)) == 0.5, "the cap is that of the cell"
+    assert score_of(row(steps=100.0, success=0.9, optimal_steps_mean=None, cap=None)) == 0.9
 
 
 def test_interquartile_mean_leaves_out_the_outer_quarters():

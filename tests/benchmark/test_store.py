@@ -2,14 +2,17 @@
 
 import multiprocessing
 import os
+import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 
 import pytest
 
 from sb3_progpolicy.benchmark.cell import CellResult
 from sb3_progpolicy.benchmark.store import Store, open_store
 from sb3_progpolicy.benchmark.suite import parse_suite
+from sb3_progpolicy.cli import run
 from tests.benchmark.small import RESULT, ROW, SMALL
 
 
@@ -96,3 +99,21 @@ def test_cell_of_a_dead_runner_is_taken_over_but_not_for_ever(tmp_path, monkeypa
     monkeypatch.setattr("sb3_progpolicy.benchmark.store.STALE", -1.0)
     assert store.claim(keys[:1]) == keys[0]
     store.close()
+
+
+def test_reading_makes_nothing_in_another_programs_database(tmp_path, capsys):
+    path = tmp_path / "other.db"
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("CREATE TABLE notes (text)")
+    before = path.read_bytes()
+    assert run(["benchmark", "status", str(path)]) == 2
+    assert "is not a store: it has no table cells, members, rows" in capsys.readouterr().err
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("prefix", ["", "sqlite:///"])
+def test_reading_makes_no_store(tmp_path, capsys, prefix):
+    path = tmp_path / "none.db"
+    assert run(["benchmark", "status", f"{prefix}{path}"]) == 2
+    assert "none.db does not exist" in capsys.readouterr().err
+    assert not path.exists()
