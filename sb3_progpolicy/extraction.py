@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -39,8 +38,9 @@ def extract_program(model: BaseAlgorithm, **metadata: Any) -> Program:
 
     It reads what the environment gives. What ``VecNormalize`` does to observations is folded into it, which is exact as
     long as ``clip_obs`` is not reached. Other wrappers are named in ``metadata["wrappers"]``, and
-    the symmetry that ties the weights in ``metadata["symmetry"]``, and the conditions that were tried in
-    ``metadata["growth"]``, where the search was by growth.
+    the variations that it was trained on in ``metadata["trained_on"]``, the symmetry that ties the weights in
+    ``metadata["symmetry"]``, and the conditions that were tried in ``metadata["growth"]``, where the search was by
+    growth.
 
     :param model: of any algorithm, with the policy ``ProgPolicy`` or ``PRLPolicy``
     :param metadata: JSON values to keep with it; environment id, seed, number of steps and way of
@@ -61,6 +61,9 @@ def extract_program(model: BaseAlgorithm, **metadata: Any) -> Program:
     origin = {"env": env_id, "seed": model.seed, "timesteps": model.num_timesteps}
     if env_kwargs := _plain(getattr(model, "env_kwargs", {})):
         origin["env_kwargs"] = env_kwargs
+    variations = getattr(getattr(model, "tasks", None), "variations", ())
+    if any(variations) and (plain := _plain(variations)):
+        origin["trained_on"] = plain
     origin["learned_by"] = getattr(model, "learned_by", LEARNED_BY[0])
     if policy.module.group is not None:
         origin["symmetry"] = policy.module.group.members[0].name
@@ -75,12 +78,12 @@ def extract_program(model: BaseAlgorithm, **metadata: Any) -> Program:
     return program if normalizer is None else _fold(program, normalizer)
 
 
-def _plain(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Return constructor arguments that JSON can hold; none if one is of another kind."""
+def _plain(values: Any) -> Any:
+    """Return what JSON can hold; ``None`` if a part is of another kind."""
     try:
-        return dict(json.loads(json.dumps(dict(env_kwargs), allow_nan=False)))
+        return json.loads(json.dumps(values, allow_nan=False))
     except (TypeError, ValueError):
-        return {}
+        return None
 
 
 def _fold(program: Program, normalizer: VecNormalize) -> Program:

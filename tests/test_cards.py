@@ -1,5 +1,6 @@
 """Model cards and comparisons of runs."""
 
+import dataclasses
 import json
 
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from sb3_progpolicy import ReptilePPO
 from sb3_progpolicy.cli import run
 from sb3_progpolicy.experiment.comparison import read_curve
+from sb3_progpolicy.pretrained import load_pretrained
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +69,19 @@ def test_a_card_says_what_was_trained_on(tmp_path):
     text = output.read_text(encoding="utf-8")
     assert "| n_discs 2 | easier |" in text
     assert "| n_discs 3 | trained |" in text
+
+
+@pytest.mark.parametrize(("known", "relation"), [([{"n_discs": 1}, {"n_discs": 2}], "extrapolated"), (None, "")])
+def test_a_bare_program_is_compared_with_what_its_file_says_alone(tmp_path, known, relation):
+    program = load_pretrained("Hanoi-v0")
+    path, output = tmp_path / "program.json", tmp_path / "card.md"
+    about = program.metadata if known is None else {**program.metadata, "trained_on": known}
+    dataclasses.replace(program, metadata=about).save(path)
+    arguments = ["card", str(path), "--set", "n_discs=3", "--episodes", "1", "--no-film", "-o", str(output)]
+    assert run(arguments) == 0
+    text = output.read_text(encoding="utf-8")
+    assert f"| n_discs 3 | {relation} | 100%" in text
+    assert ("* Trained on: {'n_discs': 1}, {'n_discs': 2}" in text) == (known is not None)
 
 
 def test_a_card_where_there_is_no_goal(tmp_path):

@@ -10,6 +10,7 @@ import pytest
 import yaml
 from PIL import Image, ImageSequence
 
+from progpolicy_envs import get_domain
 from sb3_progpolicy.cli import run
 from sb3_progpolicy.cli.parsing import parse_variations, repeat_flags
 from sb3_progpolicy.programs import load_program
@@ -82,7 +83,9 @@ def test_run_folder_holds_model_program_and_what_was_run(trained):
     config = yaml.safe_load((trained / "config.yml").read_text())
     assert (config["algo"], config["env"], config["seed"]) == ("reptile_ppo", "Hanoi-v0", 0)
     assert config["hyperparams"]["n_steps"] == 16
-    assert load_program(trained / "program.json").metadata["timesteps"] == 512
+    about = load_program(trained / "program.json").metadata
+    assert about["timesteps"] == 512
+    assert about["trained_on"] == list(get_domain("Hanoi-v0").train)
     assert {row["timesteps"] for row in json.loads((trained / "evaluations.json").read_text())} == {0, 256, 512}
 
 

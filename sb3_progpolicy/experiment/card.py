@@ -59,6 +59,9 @@ def _training(source: Source, folder: Path | None) -> list[str]:
     if folder is None:
         known = {} if source.program is None else source.program.metadata
         facts = [f"* {name}: {value}" for name, value in known.items() if not isinstance(value, (dict, list))]
+        trained = _trained_on(source, folder)
+        if trained:
+            facts.append(f"* Trained on: {', '.join(map(str, trained))}")
         return ["## Training", "", *(facts or ["Nothing is known of it."]), ""]
     config = read_config(folder)
     method = METHODS[config.algo]
@@ -95,13 +98,25 @@ def _training(source: Source, folder: Path | None) -> list[str]:
     ]
 
 
+def _trained_on(source: Source, folder: Path | None) -> Sequence[dict[str, Any]] | None:
+    """Return the variations that a run, a shipped program or a file that says so was trained on, else ``None``."""
+    domain = find_domain(source.env_id)
+    if folder is not None:
+        return None if domain is None else trained_variations(read_config(folder), domain)
+    known = None if source.program is None else source.program.metadata.get("trained_on")
+    if isinstance(known, list) and known and all(isinstance(variation, dict) for variation in known):
+        return known
+    shipped = source.program is not None and not Path(source.name).exists()
+    return domain.train if domain is not None and shipped else None
+
+
 def _name(variation: Mapping[str, Any]) -> str:
     return ", ".join(f"{key} {value}" for key, value in variation.items()) or "as it is"
 
 
 def _table(source: Source, folder: Path | None, rows: Sequence[Evaluation], n_episodes: int) -> list[str]:
     domain = find_domain(source.env_id)
-    trained = None if domain is None or folder is None else trained_variations(read_config(folder), domain)
+    trained = _trained_on(source, folder)
     lines = [
         "## Results",
         "",
@@ -113,8 +128,10 @@ def _table(source: Source, folder: Path | None, rows: Sequence[Evaluation], n_ep
         "|---|---|---:|---:|---:|---:|---:|",
     ]
     for row in rows:
-        known = domain is not None and domain.size in row.variation
-        relation = domain.relation(dict(row.variation), trained) if domain is not None and known else ""
+        relation = ""
+        sizes = [] if domain is None else [known.get(domain.size) for known in (row.variation, *(trained or ()))]
+        if domain is not None and trained and all(isinstance(size, int) for size in sizes):
+            relation = domain.relation(dict(row.variation), trained)
         name = _name(row.variation)
         optimum = "-" if row.optimal_steps_mean is None else f"{row.optimal_steps_mean:.1f}"
         ratio = "-" if row.ratio is None else f"{row.ratio:.2f}"

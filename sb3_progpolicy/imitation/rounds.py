@@ -340,4 +340,6 @@ class Run:
 
     @property
     def _metadata(self) -> dict[str, Any]:
-        return {**self.origin, "learned_by": "imitation", "labelled_states": self.n_labelled or self.learner.n_states}
+        trained_on = [dict(variation) for variation in self.variations]
+        about = {"learned_by": "imitation", "labelled_states": self.n_labelled or self.learner.n_states}
+        return {**self.origin, **about, **({"trained_on": trained_on} if any(trained_on) else {})}

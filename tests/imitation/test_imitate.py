@@ -186,6 +186,7 @@ def test_planner_is_imitated_on_training_variations_only(monkeypatch):
     program = imitate("planner", "Stacking-v0", **{**SMALL, "max_conditions": 2})
     assert seen == {(("n_plates", n),) for n in (1, 2, 3, 4)}
     assert program.metadata["teacher"] == "planner"
+    assert program.metadata["trained_on"] == [{"n_plates": n} for n in (1, 2, 3, 4)]
 
 
 def test_imitation_takes_one_thread_of_blas_and_leaves_the_others_as_they_were():
