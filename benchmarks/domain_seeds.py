@@ -8,8 +8,8 @@ Each seed trains from scratch with ``sb3_progpolicy/hyperparams/reptile_ppo.yml`
 then run, crisp and soft, on every training and validation variation, on starts that training did not use. With
 --final it is run on the unseen variations, too, which nothing is chosen by. With --simplify each program is also
 simplified: few terms with the same success and steps on the training variations (``equally_good="outcome"``). Then
---ship takes the simplified one of the median seed. A finished seed is kept in ``runs/`` and one that is interrupted
-goes on from its last checkpoint.
+--ship takes the simplified one of the median seed. A finished seed is kept in ``runs/``, its rows too as long as the
+commit is the same, and one that is interrupted goes on from its last checkpoint.
 
 Writes ``benchmarks/results/<name>.csv``, a picture of the crisp programs (simplified ones if asked for), and a
 ``.json`` with command, commit and versions. Says which seed is the median by what was reached in training; --ship puts
@@ -20,8 +20,10 @@ from __future__ import annotations
 
 import argparse
 import io
+import json
 import shutil
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -50,17 +52,52 @@ EVALUATION_SEED = 10_000
 Row = dict[str, Any]
 
 
-def run_seed(job: tuple[str, int, Path, dict[str, Any], int, bool, bool]) -> list[Row]:
-    """Train and evaluate one seed."""
-    env_id, seed, folder, overrides, episodes, final, simplified = job
-    program = train(env_id, seed, folder, overrides)
-    if find_domain(env_id) is None:
-        return _about(seed, program, returns_of(program, env_id, episodes))
-    rows = _about(seed, program, results_of(program, env_id, episodes, final, SEMANTICS))
-    if simplified:
-        small = simplified_of(program, env_id, folder / f"seed_{seed}{SMALL}.json")
-        found = results_of(small, env_id, episodes, final, ("crisp",))
-        rows += _about(seed, small, ({**row, "semantics": "simplified"} for row in found))
+@dataclass(frozen=True)
+class Job:
+    """What is done for one seed.
+
+    :param env_id: environment id
+    :param seed: of the training
+    :param folder: where programs, checkpoints and rows are kept
+    :param overrides: hyperparameters in place of the shipped ones
+    :param episodes: on each variation
+    :param final: whether to look at the unseen variations
+    :param simplified: whether to simplify the program, and run that, too
+    :param commit: of the code that does it
+    """
+
+    env_id: str
+    seed: int
+    folder: Path
+    overrides: dict[str, Any]
+    episodes: int
+    final: bool
+    simplified: bool
+    commit: str
+
+
+def run_seed(job: Job) -> list[Row]:
+    """Train and evaluate one seed, or return what an earlier run of the same code has left of it."""
+    program = train(job.env_id, job.seed, job.folder, job.overrides)
+    path = job.folder / f"seed_{job.seed}.rows.json"
+    arguments = [job.episodes, job.final, job.simplified]
+    about = {"program": program_digest(program), "arguments": arguments, "commit": job.commit}
+    if path.exists() and (known := json.loads(path.read_text()))["about"] == about:
+        return known["rows"]
+    rows = rows_of(program, job)
+    write_atomically(path, json.dumps({"about": about, "rows": rows}))
+    return rows
+
+
+def rows_of(program: Program, job: Job) -> list[Row]:
+    """Run the program of a seed."""
+    if find_domain(job.env_id) is None:
+        return _about(job.seed, program, returns_of(program, job.env_id, job.episodes))
+    rows = _about(job.seed, program, results_of(program, job.env_id, job.episodes, job.final, SEMANTICS))
+    if job.simplified:
+        small = simplified_of(program, job.env_id, job.folder / f"seed_{job.seed}{SMALL}.json")
+        found = results_of(small, job.env_id, job.episodes, job.final, ("crisp",))
+        rows += _about(job.seed, small, ({**row, "semantics": "simplified"} for row in found))
     return rows
 
 
@@ -231,12 +268,12 @@ def main() -> None:
     spec_of(options.env)
     if options.simplify and find_domain(options.env) is None:
         parser.error(f"--simplify is for domains, whose variations it looks at; {options.env} is of none")
-    commit()  # of the code that is loaded now
+    origin = commit()  # of the code that is loaded now
     overrides = overrides_from(options.hyperparams)
     name = options.name or f"{options.env.rpartition(':')[2].rpartition('-')[0].lower()}_seeds"
     folder = Path("runs") / name
-    common = (folder, overrides, options.episodes, options.final, options.simplify)
-    jobs = [(options.env, seed, *common) for seed in range(options.seeds)]
+    common = (folder, overrides, options.episodes, options.final, options.simplify, origin)
+    jobs = [Job(options.env, seed, *common) for seed in range(options.seeds)]
     with pool(options.workers) as workers:
         done = track(workers.imap(run_seed, jobs), "Seeds", total=len(jobs))
         rows = [row for seed_rows in done for row in seed_rows]
