@@ -20,7 +20,7 @@ from sb3_progpolicy.extraction import extract_program, holds_program, wrappers_o
 from sb3_progpolicy.interaction import VecInteractionHistory
 from sb3_progpolicy.programs.interpreter import ProgramRunner, Semantics, join_inputs
 from sb3_progpolicy.programs.syntax import ProgramData
-from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, refuse_unread
+from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, refuse_starts, refuse_unread
 from sb3_progpolicy.spaces import action_spec, interaction_space, shaped
 from sb3_progpolicy.surroundings import check_fit, own_env_kwargs, refuse_wrappers
 from sb3_progpolicy.vec_env import BatchedVecEnv, make_fast_vec_env
@@ -86,7 +86,8 @@ def evaluate_program(
 
     :param program: what to evaluate
     :param env_id: environment id; by default the one in the program's metadata
-    :param variations: parameters to set, one mapping for each row of the result
+    :param variations: parameters to set, one mapping for each row of the result; with parts of a start, such as
+        ``discs``, for one episode alone
     :param n_episodes: episodes on each variation, at least 1
     :param semantics: ``"crisp"`` or ``"soft"``
     :param seed: variation ``i`` is seeded with ``seed + i``
@@ -246,6 +247,8 @@ def _evaluate(
     cap = max_steps if max_steps is not None else spec.max_episode_steps
     if cap is None or cap < 1:
         raise ValueError(f"max_steps={max_steps} is not accepted; {env_id} needs a cap on steps of at least 1")
+    if n_episodes > 1:
+        refuse_starts(env_id, variations)
     rows: list[Evaluation] = []
     domain = find_domain(env_id)
     # In a batch those that have finished go on until the last has, which is expensive where a step is a simulation.

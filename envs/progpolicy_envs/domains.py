@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from itertools import product
+from numbers import Real
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -54,7 +55,12 @@ class Domain:
             if not variations:
                 raise ValueError(f"{name}={variations!r} is not accepted; {self.id} needs at least one variation there")
             for variation in variations:
-                if not isinstance(variation.get(self.size), (int, float)):
+                if not isinstance(variation, Mapping):
+                    raise ValueError(
+                        f"{name}={variations!r} is not accepted; it is a sequence of mappings from parameters to values"
+                    )
+                size = variation.get(self.size)
+                if isinstance(size, bool) or not isinstance(size, Real):
                     raise ValueError(
                         f"{name}: {variation!r} is not accepted; it gives {self.size!r}, the size, as a number"
                     )

@@ -120,8 +120,8 @@ class HanoiEnv(PlanningEnv):
     |         |             |     |     | and target continue the alternation, the third base has the other colour |
     | 2, 5, 8 | empty[peg]  | 0   | 1   | 1 where the peg holds no disc                                            |
 
-    Classical solutions by hand rest on such colours: in a shortest solution a disc is never put onto one of its own
-    colour. Which disc has just been moved cannot be seen; a policy has to remember it.
+    Classical solutions by hand rest on such colours: in a shortest solution from a whole tower a disc is never put onto
+    one of its own colour. Which disc has just been moved cannot be seen; a policy has to remember it.
 
     ## Rewards
     -0.01 a step, a further -0.05 for an illegal move, +1 when the last disc reaches the target.
@@ -133,7 +133,8 @@ class HanoiEnv(PlanningEnv):
     not done one after another, and a tower whose largest discs are in place is one of fewer discs.
 
     ## Episode End
-    Terminated when all discs lie on the target peg; truncated after 500 steps (``max_episode_steps``).
+    Terminated when all discs lie on the target peg; truncated after 500 steps (``max_episode_steps``). From nine discs
+    on a shortest solution is longer, 511 moves and more: give ``gym.make`` a larger ``max_episode_steps``.
 
     ## Information
     ``info["is_success"]`` at every step; at reset also ``info["variation"]`` and ``info["optimal_steps"]``, the
@@ -336,8 +337,17 @@ class HanoiVectorEnv(PlanningVectorEnv):
     @classmethod
     def count_starts(cls, variation: Mapping[str, Any], any_state: bool = False) -> int:
         """Return the number of pairs of pegs, times that of legal states, see :class:`PlanningVectorEnv`."""
-        n_discs = cls.variations.update(cls.variations.defaults, variation)["n_discs"]
+        n_discs = cls._counted(variation)["n_discs"]
         return len(cls._pairs_of(variation)) * (N_PEGS**n_discs if any_state else 1)
+
+    @classmethod
+    def _counted(cls, variation: Mapping[str, Any]) -> Variation:
+        known = {**cls.variations.defaults, **cls.variations.parse(variation)}
+        # A peg that is not given is another one than the peg that is.
+        for name, other in (("source", "target"), ("target", "source")):
+            if name not in variation and known[name] == known[other]:
+                known[name] = RANDOM
+        return cls.variations.update({}, known)
 
     @classmethod
     def _pairs_of(cls, given: Mapping[str, Any]) -> list[tuple[int, int]]:

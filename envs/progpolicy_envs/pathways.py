@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,160 +12,30 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from progpolicy_envs.counting import subsets
+from progpolicy_envs.hikes import VARIATIONS, completed, draw_task, layout_value, named_layout, read_state
 from progpolicy_envs.layouts import (
     DIRECTIONS,
     LAYOUTS,
     N_CELLS,
     N_COLUMNS,
-    N_ROWS,
     NEIGHBOURS,
     PATH,
     RANDOM_LAYOUTS,
     STAR,
     START,
     Layout,
-    draw_layout,
-    read_layout,
-    split_rows,
 )
 from progpolicy_envs.planners import hiking as planner
 from progpolicy_envs.planning import PlanningEnv
 from progpolicy_envs.rendering import hiking_frame
-from progpolicy_envs.states import is_sequence, read_cell
-from progpolicy_envs.variation import (
-    RANDOM,
-    ChoiceParameter,
-    IntParameter,
-    Variation,
-    VariationSpace,
-    check_n_done,
-    draw_n_done,
-    n_done_parameter,
-)
+from progpolicy_envs.variation import RANDOM, Variation, VariationSpace
 from progpolicy_envs.vector import PlanningVectorEnv
 
-MAX_STARS = 12
 STEP_REWARD, ILLEGAL_REWARD, STAR_REWARD = -0.01, -0.05, 1.0
 
 ACTION_NAMES = tuple(DIRECTIONS)
 BLOCKED, PATHWAY = -1.0, 0.0
 _OBSERVATION_SPACE = spaces.Box(-1.0, 1.0, (N_CELLS,), dtype=np.float32)
-
-
-def _are_rows(value: Any) -> bool:
-    return is_sequence(value) and all(isinstance(row, str) for row in value)
-
-
-@dataclass(frozen=True)
-class LayoutParameter(ChoiceParameter):
-    """The name of a map, or a map of the user's."""
-
-    @property
-    def allowed(self) -> str:
-        """The accepted values in words."""
-        return f"{super().allowed}, or a map as rows of text"
-
-    def parse(self, value: Any) -> str:
-        """Return the name, or the rows of the map joined by line feeds.
-
-        :param value: one of ``choices``, or rows as for :func:`~progpolicy_envs.layouts.read_layout`
-        :raises ValueError: if it is neither
-        """
-        # A text in one line is a name, unless it has a start.
-        is_map = START in value if isinstance(value, str) else _are_rows(value)
-        if not is_map:
-            return super().parse(value)
-        rows = split_rows(value)
-        try:
-            read_layout(rows)
-        except ValueError as error:
-            raise ValueError(f"{self.name}: {error}") from None
-        return "\n".join(rows)
-
-
-def named_layout(value: str) -> Layout:
-    """Return the map of a value of ``layout`` that is not random."""
-    return LAYOUTS[value] if value in LAYOUTS else read_layout(split_rows(value))
-
-
-def _check_variation(variation: Variation) -> None:
-    """Raise ``ValueError`` if the map has fewer places for stars than there are stars, or none is left to collect."""
-    check_n_done(variation, "n_stars")
-    n_stars, layout = variation["n_stars"], variation["layout"]
-    n_places = MAX_STARS if layout in RANDOM_LAYOUTS else len(named_layout(layout).star_cells)
-    if n_stars > n_places:
-        raise ValueError(f"n_stars={n_stars} is not accepted; on this layout n_stars is at most {n_places}")
-
-
-VARIATIONS = VariationSpace(
-    IntParameter("n_stars", 1, MAX_STARS, 3, "number of stars"),
-    LayoutParameter(
-        "layout",
-        (*LAYOUTS, *RANDOM_LAYOUTS),
-        "valley",
-        "the map; 'random' draws another one for every episode, 'practice' one of others",
-    ),
-    n_done_parameter(MAX_STARS - 1, "stars that have been collected"),
-    check=_check_variation,
-    starts={
-        "hiker": "row and column of the hiker",
-        "stars": "row and column of each star that is left",
-    },
-)
-
-
-def draw_task(
-    generator: np.random.Generator, variation: Variation
-) -> tuple[int, Layout, int | np.int64, NDArray[np.int64]]:
-    """Draw the number of stars, the map, where it is random, the hiker's cell and the cells of the stars that are left.
-
-    The hiker stands on the map's start or, if stars have been collected, where the last of them was.
-
-    :param generator: the environment's generator
-    :param variation: values of ``n_stars``, ``layout`` and ``n_done``
-    """
-    value = variation["layout"]
-    layout = draw_layout(value, generator) if value in RANDOM_LAYOUTS else named_layout(value)
-    stars = generator.permutation(layout.star_cells)[: variation["n_stars"]]
-    n_done = draw_n_done(variation, "n_stars", generator)
-    return len(stars), layout, stars[n_done - 1] if n_done else layout.start, stars[n_done:]
-
-
-def layout_value(layout: Layout) -> str:
-    """Return the value of ``layout`` that stands for a map: its name, or its rows joined by line feeds."""
-    names = [name for name, named in LAYOUTS.items() if named.rows == layout.rows]
-    return names[0] if names else "\n".join(layout.rows)
-
-
-def _reachable_cell(name: str, value: Any, layout: Layout) -> int:
-    row, column = read_cell(name, value, N_ROWS, N_COLUMNS)
-    cell = row * N_COLUMNS + column
-    if layout.distances[layout.start, cell] < 0:
-        raise ValueError(f"{name}: [{row}, {column}] is not accepted; no way leads there from the map's start")
-    return cell
-
-
-def read_state(state: Mapping[str, Any]) -> tuple[int, Layout, int, list[int]]:
-    """Return the number of stars, the map, the hiker's cell and the cells of the stars that are left.
-
-    :param state: values of ``n_stars``, ``layout``, ``hiker`` and ``stars``; see :attr:`PathwayEnv.state`
-    :raises ValueError: if it is not a state
-    """
-    n_stars, layout_name, stars = state["n_stars"], state["layout"], state["stars"]
-    variation = VARIATIONS.update({}, {"n_stars": n_stars, "layout": layout_name})
-    if variation["layout"] in RANDOM_LAYOUTS:
-        raise ValueError(f"layout={variation['layout']!r} is not accepted in a state; give the map as rows of text")
-    layout = named_layout(variation["layout"])
-    if not is_sequence(stars) or len(stars) > variation["n_stars"]:
-        raise ValueError(
-            f"stars={stars!r} is not accepted; stars are up to n_stars={n_stars} pairs of row and column, one for each "
-            "star that is left"
-        )
-    hiker = _reachable_cell("hiker", state["hiker"], layout)
-    cells = [_reachable_cell("stars", star, layout) for star in stars]
-    if len({hiker, *cells}) <= len(cells):
-        raise ValueError(f"stars={stars!r} is not accepted; hiker and stars have each a cell of their own")
-    return variation["n_stars"], layout, hiker, cells
 
 
 class MapView:
@@ -243,6 +112,9 @@ class PathwayEnv(MapView, PlanningEnv):
             "hiker": list(divmod(self.hiker, N_COLUMNS)),
             "stars": [list(cell) for cell in self._star_cells()],
         }
+
+    def _completed(self, variation: Variation, start: Mapping[str, Any]) -> dict[str, Any]:
+        return completed(variation, self._state(), start, self.np_random)
 
     def _set_state(self, state: Mapping[str, Any]) -> None:
         self._place(*read_state(state))
@@ -381,6 +253,9 @@ class PathwayVectorEnv(MapView, PlanningVectorEnv):
             "hiker": list(divmod(int(self._hikers[row]), N_COLUMNS)),
             "stars": [list(divmod(star, N_COLUMNS)) for star in self._left(row)],
         }
+
+    def _completed(self, row: int, start: Mapping[str, Any]) -> dict[str, Any]:
+        return completed(self.row_variations[row], self._state_of(row), start, self._generators[row])
 
     def _set_state_of(self, row: int, state: Mapping[str, Any]) -> None:
         _, layout, hiker, stars = read_state(state)

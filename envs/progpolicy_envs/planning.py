@@ -12,6 +12,16 @@ from progpolicy_envs.single import DomainEnv, require_reset
 from progpolicy_envs.variation import Variation
 
 
+def refuse_solved(start: Mapping[str, Any], optimal_steps: int) -> None:
+    """Raise ``ValueError`` if nothing is left to be done in a start.
+
+    :param start: its given parts, for the message
+    :param optimal_steps: that the planner needs from there
+    """
+    if not optimal_steps:
+        raise ValueError(f"{dict(start)} is not accepted; nothing is left to be done there")
+
+
 class PlanningEnv(DomainEnv):
     """An environment with a Discrete action space that can be drawn as a picture and as a text."""
 
@@ -26,7 +36,8 @@ class PlanningEnv(DomainEnv):
     def set_state(self, state: Mapping[str, Any]) -> Any:
         """Put the running episode into a state.
 
-        The variation in force, with which the next episode begins, stays as it is.
+        The variation in force, with which the next episode begins, stays as it is. With ``context="observed"`` the
+        numbers are those of the state.
 
         :param state: what :attr:`state` returns, or parts of it; all others stay as they are
         :return: the observation
@@ -37,6 +48,7 @@ class PlanningEnv(DomainEnv):
         if unknown:
             raise ValueError(f"{unknown} are not parts of a state; its parts are {', '.join(present)}")
         self._set_state({**present, **state})
+        self._shown = self.variations.shown(self.variation, self._state())
         self._show()
         return self._observation()
 
@@ -73,10 +85,20 @@ class PlanningEnv(DomainEnv):
     def _start(self, variation: Variation, start: Mapping[str, Any]) -> None:
         self._draw(variation)
         if start:
-            self._set_state({**self._state(), **start})
+            self._set_state(self._completed(variation, start))
+            refuse_solved(start, self._optimal_steps())
 
     def _reset_info(self) -> dict[str, Any]:
         return {"optimal_steps": self._optimal_steps()}
+
+    def _completed(self, variation: Variation, start: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the state that begins an episode, of which parts are given and all others have been drawn.
+
+        :param variation: of the episode
+        :param start: the parts that are given
+        :raises ValueError: if they do not fit the variation
+        """
+        return {**self._state(), **start}
 
     @abstractmethod
     def _draw(self, variation: Variation) -> None:

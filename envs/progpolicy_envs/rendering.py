@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,8 @@ class Display:
 
     :param fps: frames per second at which :meth:`show` paces itself
     """
+
+    _open: ClassVar[int] = 0  # pygame has one window, which the last of several displays closes
 
     def __init__(self, fps: int) -> None:
         self.fps = fps
@@ -43,6 +45,7 @@ class Display:
             ) from error
         if self._window is None:
             pygame.init()
+            Display._open += 1
             self._window = pygame.display.set_mode((frame.shape[1], frame.shape[0]))
             self._clock = pygame.time.Clock()
         pygame.event.pump()
@@ -55,9 +58,11 @@ class Display:
         if self._window is not None:
             import pygame
 
-            pygame.display.quit()
-            pygame.quit()
             self._window = None
+            Display._open -= 1
+            if not Display._open:
+                pygame.display.quit()
+                pygame.quit()
 
 
 INK, PAPER, WOOD = (40, 44, 52), (250, 249, 246), (164, 132, 96)
@@ -103,7 +108,7 @@ def hanoi_frame(discs: Sequence[int], source: int, target: int) -> Frame:
             half = 14 + 56 * (disc + 1) / len(discs)
             box(centre - half, level - thickness + 1, centre + half, level, LIGHT_DISC if disc % 2 else DARK_DISC, 5)
             level -= thickness
-    return np.asarray(image.resize((width, height), Image.Resampling.LANCZOS))
+    return np.array(image.resize((width, height), Image.Resampling.LANCZOS))
 
 
 SAND, GRASS, STONE, STONE_LIGHT = (232, 214, 170), (126, 160, 98), (112, 112, 116), (150, 150, 154)
@@ -136,7 +141,7 @@ def hiking_frame(rows: Sequence[str], hiker: Place, stars: Sequence[Place], n_st
     _draw_star(draw, 18 * SCALE, (height - footer / 2) * SCALE, 10 * SCALE)
     label = f"{n_stars - len(stars)} of {n_stars} collected"
     draw.text((36 * SCALE, (height - footer / 2) * SCALE), label, fill=INK, anchor="lm", font_size=14 * SCALE)
-    return np.asarray(image.resize((width, height), Image.Resampling.LANCZOS))
+    return np.array(image.resize((width, height), Image.Resampling.LANCZOS))
 
 
 def _draw_ground(draw: Any, left: float, top: float, size: float, kind: str) -> None:
@@ -240,4 +245,4 @@ def stacking_frame(n_side: int, plates: Sequence[Place], n_plates: int, gripper:
         draw.rounded_rectangle(at((middle - half, top), (middle + half, top + 24)), 7 * SCALE, fill=PLATES[slot])
         label(middle, top + 12, str(n_plates - slot), PAPER, 13)
     label(middle, height - 16, "stack", INK, 14)
-    return np.asarray(image.resize((width, height), Image.Resampling.LANCZOS))
+    return np.array(image.resize((width, height), Image.Resampling.LANCZOS))

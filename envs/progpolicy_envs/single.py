@@ -12,6 +12,7 @@ from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 
 from progpolicy_envs.rendering import Display
+from progpolicy_envs.states import check_choice
 from progpolicy_envs.variation import Variation, VariationSpace, with_context
 
 
@@ -42,12 +43,15 @@ class DomainEnv(gym.Env[Any, Any], ABC):
         render_mode: str | None = None,
         context: str = "hidden",
     ) -> None:
+        check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         names = self.variations.context_names
         self.observation_space = with_context(observation_space, names, context)
         self.context = context
         if context == "observed":
             self.observation_names = (*type(self).observation_names, *names)
         self.variation: Variation = self.variations.update({}, variation)
+        #: The variation whose numbers are observed: that in force, or that of the state that was set.
+        self._shown = self.variation
         self.render_mode = render_mode
         self._display = Display(self.metadata["render_fps"])
         self._started = False
@@ -67,7 +71,7 @@ class DomainEnv(gym.Env[Any, Any], ABC):
         super().reset(seed=seed)
         self._started = False
         self._start(variation, start)
-        self.variation = variation
+        self.variation = self._shown = variation
         self._started = True
         self._show()
         return self._observation(), {"is_success": False, "variation": dict(variation), **self._reset_info()}
@@ -81,7 +85,7 @@ class DomainEnv(gym.Env[Any, Any], ABC):
         observation = self._observe()
         if self.context == "hidden":
             return observation
-        return np.concatenate([observation, self.variations.encode(self.variation)], dtype=np.float32)
+        return np.concatenate([observation, self.variations.encode(self._shown)], dtype=np.float32)
 
     def _show(self) -> None:
         """Show the state in the window; to be called after each change of it."""

@@ -23,6 +23,7 @@ from progpolicy_envs.variation import (
     IntParameter,
     Variation,
     VariationSpace,
+    check_left,
     check_n_done,
     draw_n_done,
     n_done_parameter,
@@ -160,7 +161,8 @@ class StackingEnv(PlanningEnv):
     Plates and gripper on cells drawn with the environment's generator; the gripper may start above a plate. The
     ``n_done`` largest plates are on the stack already.
     ``env.reset(options={"n_plates": 2, "plates": [[0, 0], [3, 4]], "gripper": [2, 2]})`` gives them instead, as rows
-    and columns, the largest plate first; of ``n_plates`` plates those that are left out are on the stack.
+    and columns, the largest plate first; of ``n_plates`` plates those that are left out are on the stack, as many as
+    ``n_done`` says unless it is 0.
 
     ## Episode End
     Terminated when all plates are on the stack; truncated after 500 steps (``max_episode_steps``).
@@ -234,6 +236,10 @@ class StackingEnv(PlanningEnv):
         self.n_plates = len(cells)
         self.plates = [divmod(cell, N_SIDE) for cell in cells[n_done:].tolist()]
         self.gripper = divmod(gripper, N_SIDE)
+
+    def _completed(self, variation: Variation, start: Mapping[str, Any]) -> dict[str, Any]:
+        check_left(variation, start, "n_plates", "plates")
+        return super()._completed(variation, start)
 
     def _state(self) -> dict[str, Any]:
         plates = [list(plate) for plate in self.plates]
@@ -376,6 +382,10 @@ class StackingVectorEnv(PlanningVectorEnv):
         left = self._plates[row][self._n_picked[row] :]
         plates = [list(divmod(cell, N_SIDE)) for cell in left.tolist()]
         return {"n_plates": int(self._n_plates[row]), "plates": plates, "gripper": self._grippers[row].tolist()}
+
+    def _completed(self, row: int, start: Mapping[str, Any]) -> dict[str, Any]:
+        check_left(self.row_variations[row], start, "n_plates", "plates")
+        return super()._completed(row, start)
 
     def _set_state_of(self, row: int, state: Mapping[str, Any]) -> None:
         n_plates, plates, gripper = read_state(state)

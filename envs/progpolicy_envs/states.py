@@ -33,3 +33,10 @@ def read_cell(name: str, value: Any, n_rows: int, n_columns: int) -> Cell:
             f"{n_columns - 1}"
         )
     return int(numbers[0]), int(numbers[1])
+
+
+def check_choice(name: str, value: Any, choices: Sequence[Any]) -> None:
+    """Raise ``ValueError`` if an argument is not one of the choices."""
+    if value not in choices:
+        allowed = ", ".join(repr(choice) for choice in choices)
+        raise ValueError(f"{name}={value!r} is not accepted; {name} is one of {allowed}")

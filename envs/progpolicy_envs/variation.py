@@ -12,6 +12,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from progpolicy_envs.states import is_sequence
+
 Variation = dict[str, Any]
 #: Whether the variation's numbers are part of the observation.
 CONTEXTS = ("hidden", "observed")
@@ -50,6 +52,20 @@ class IntParameter:
     def context_names(self) -> tuple[str, ...]:
         """Names of the numbers that :meth:`encode` returns."""
         return () if self.of_start else (self.name, *(f"{self.name}={name}" for name in self.names))
+
+    def is_drawn(self, value: Any) -> bool:
+        """Return whether a value stands for one that is drawn for each episode.
+
+        :param value: an accepted one
+        """
+        return value in self.names
+
+    def is_one_value(self, value: Any) -> bool:
+        """Return whether a sequence is one value, and not one value for each environment of a batch; here none is.
+
+        :param value: a sequence
+        """
+        return False
 
     def encode(self, value: int | str) -> list[float]:
         """Return a value as numbers from 0 to 1: where it lies between the bounds, then one for each of the names.
@@ -97,6 +113,25 @@ def check_n_done(variation: Mapping[str, Any], size: str) -> None:
         raise ValueError(f"n_done={n_done} is not accepted with {size}={variation[size]}; n_done is less than {size}")
 
 
+def check_left(variation: Mapping[str, Any], start: Mapping[str, Any], size: str, things: str) -> None:
+    """Raise ``ValueError`` if a start gives other things than ``n_done`` leaves.
+
+    :param variation: with the size
+    :param start: parts of a start that are given
+    :param size: name of the number of things
+    :param things: name of the part of the start that holds those that are left
+    """
+    n_done = variation.get("n_done", 0)
+    if n_done in (0, RANDOM) or not is_sequence(start.get(things)):
+        return
+    left, given = variation[size] - n_done, len(start[things])
+    if given != left:
+        raise ValueError(
+            f"{given} {things} are not accepted with n_done={n_done} and {size}={variation[size]}, which leave {left}; "
+            "give so many, or n_done=0"
+        )
+
+
 def draw_n_done(variation: Mapping[str, Any], size: str, rng: np.random.Generator) -> int:
     """Return how many things are done with when an episode begins; nothing is drawn for a number.
 
@@ -134,6 +169,20 @@ class ChoiceParameter:
     def context_names(self) -> tuple[str, ...]:
         """Names of the numbers that :meth:`encode` returns."""
         return tuple(f"{self.name}={choice}" for choice in self.choices)
+
+    def is_drawn(self, value: Any) -> bool:
+        """Return whether a value stands for one that is drawn for each episode; here none does.
+
+        :param value: an accepted one
+        """
+        return False
+
+    def is_one_value(self, value: Any) -> bool:
+        """Return whether a sequence is one value, and not one value for each environment of a batch; here none is.
+
+        :param value: a sequence
+        """
+        return False
 
     def encode(self, value: str) -> list[float]:
         """Return a value as one number for each of the choices, 1 where it is this one.
@@ -218,6 +267,23 @@ class VariationSpace(Mapping[str, Parameter]):
         :raises ValueError: if a name is unknown or a value is not accepted
         """
         return {name: self._named(name).parse(value) for name, value in values.items()}
+
+    def whole(self, variation: Mapping[str, Any]) -> Variation:
+        """Return a variation with the parameters of the start that were left out, which have their defaults.
+
+        :param variation: with a value for every other parameter
+        """
+        left_out = [known for known in self.values() if isinstance(known, IntParameter) and known.of_start]
+        return {**{known.name: known.default for known in left_out}, **variation}
+
+    def shown(self, variation: Mapping[str, Any], state: Mapping[str, Any]) -> Variation:
+        """Return a variation with the values that a state has, except those that are drawn for each episode.
+
+        :param variation: in force
+        :param state: parts of it are named like parameters
+        """
+        known = {name: state[name] for name in self if name in state and not self[name].is_drawn(variation[name])}
+        return {**variation, **known}
 
     @property
     def defaults(self) -> Variation:

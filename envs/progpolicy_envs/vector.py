@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, SupportsIndex
+from typing import Any, ClassVar, SupportsIndex, cast
 
 import numpy as np
 from gymnasium.spaces import Space
@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from progpolicy_envs.planning import refuse_solved
 from progpolicy_envs.single import require_reset
 from progpolicy_envs.states import is_sequence
 from progpolicy_envs.variation import Variation, VariationSpace, with_context
@@ -25,8 +26,10 @@ class DomainVectorEnv(VectorEnv, ABC):
     Autoreset is ``SAME_STEP``: where an episode ends, the returned observation opens the next one, and ``infos`` have
     the ended one in Gymnasium's form: ``infos["final_obs"][i]`` is its last observation and
     ``infos["final_info"]["is_success"][i]`` says whether it reached the goal, where ``infos["_final_obs"][i]`` and
-    ``infos["_final_info"][i]`` are true. The other infos, such as ``infos["is_success"]``, are of the step itself. A
-    variation is one value for all environments or a sequence of ``num_envs`` values.
+    ``infos["_final_info"][i]`` are true. The other infos, such as ``infos["is_success"]``, are of the step itself, and
+    not of the reset as in Gymnasium's own batches: what a planner needs from each new start is asked for, by
+    ``optimal_steps()``, and not computed at each end. A variation is one value for all environments or a sequence of
+    ``num_envs`` values.
 
     :param num_envs: number of environments
     :param observation_space: of one environment
@@ -93,11 +96,12 @@ class DomainVectorEnv(VectorEnv, ABC):
         if options:
             self._changed_variations()
         self._elapsed[:] = 0
-        self._reset_rows(self._rows)
         try:
+            self._reset_rows(self._rows)
             for row, start in enumerate(starts):
                 if start:
                     self._set_start(row, start)
+            self._check_starts(starts)
         except ValueError:
             self.row_variations = before
             self._changed_variations()
@@ -117,7 +121,7 @@ class DomainVectorEnv(VectorEnv, ABC):
         require_reset(self._started, "step()")
         rewards, terminated, infos = self._apply(self._checked(np.asarray(actions)))
         self._elapsed += 1
-        truncated = (self._elapsed >= self.max_episode_steps) & ~terminated
+        truncated = self._elapsed >= self.max_episode_steps
         observations = self._observation()
         done = terminated | truncated
         (ended,) = done.nonzero()
@@ -155,6 +159,12 @@ class DomainVectorEnv(VectorEnv, ABC):
     def _set_start(self, row: int, start: Mapping[str, Any]) -> None:
         """Replace parts of the start of one environment, which has just been reset."""
 
+    def _check_starts(self, starts: Sequence[Mapping[str, Any]]) -> None:
+        """Raise ``ValueError`` for a start in which nothing is left to be done.
+
+        :param starts: the given parts of each
+        """
+
     @abstractmethod
     def _apply(self, actions: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.bool_], Infos]:
         """Change the state by one action each; return rewards, whether an end is reached, and infos."""
@@ -172,7 +182,12 @@ class DomainVectorEnv(VectorEnv, ABC):
     def _seed_rows(self, seed: int | Sequence[int | None] | None) -> None:
         if seed is None:
             return
-        seeds = [seed + row for row in range(self.num_envs)] if isinstance(seed, SupportsIndex) else list(seed)
+        seeds: list[int | None]
+        if isinstance(seed, SupportsIndex) and not is_sequence(seed):  # an array can be an index, too
+            seeds = [int(seed) + row for row in range(self.num_envs)]
+        else:
+            given = cast("Sequence[int | None]", seed)
+            seeds = [None if row_seed is None else int(row_seed) for row_seed in given]
         if len(seeds) != self.num_envs:
             raise ValueError(f"{len(seeds)} seeds given for {self.num_envs} environments")
         for row, row_seed in enumerate(seeds):
@@ -198,7 +213,9 @@ class DomainVectorEnv(VectorEnv, ABC):
 
     def _per_row(self, name: str, value: Any) -> list[Any]:
         """Return the values of an option that are given for all environments at once, or one for each."""
-        values = list(value) if is_sequence(value) else [value] * self.num_envs
+        parameter = self.variations.get(name)
+        one = not is_sequence(value) or (parameter is not None and parameter.is_one_value(value))
+        values = [value] * self.num_envs if one else list(value)
         if len(values) != self.num_envs:
             raise ValueError(f"{name}: {len(values)} values given for {self.num_envs} environments")
         return values
@@ -224,6 +241,11 @@ class PlanningVectorEnv(DomainVectorEnv):
         """
         raise ValueError(f"the {'states' if any_state else 'starts'} of {dict(variation)} cannot be counted")
 
+    @classmethod
+    def _counted(cls, variation: Mapping[str, Any]) -> Variation:
+        """Return the whole variation whose starts are counted."""
+        return cls.variations.update(cls.variations.defaults, variation)
+
     def reset_to(self, variation: Mapping[str, Any], numbers: NDArray[np.int64], any_state: bool = False) -> Any:
         """Begin an episode in every environment in the start of a number.
 
@@ -236,7 +258,7 @@ class PlanningVectorEnv(DomainVectorEnv):
         count = self.count_starts(variation, any_state)
         if numbers.shape != (self.num_envs,) or numbers.min() < 0 or numbers.max() >= count:
             raise ValueError(f"numbers={numbers!r} are not accepted; {self.num_envs} from 0 to {count - 1} are")
-        row_variation = self.variations.update(self.variations.defaults, variation)
+        row_variation = self._counted(variation)
         self.row_variations = [row_variation] * self.num_envs
         self._changed_variations()
         self._elapsed[:] = 0
@@ -279,7 +301,17 @@ class PlanningVectorEnv(DomainVectorEnv):
         return self._optimal_steps()
 
     def _set_start(self, row: int, start: Mapping[str, Any]) -> None:
-        self._set_state_of(row, {**self._state_of(row), **start})
+        self._set_state_of(row, self._completed(row, start))
+
+    def _completed(self, row: int, start: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the state that begins an episode in one environment, as the single form does."""
+        return {**self._state_of(row), **start}
+
+    def _check_starts(self, starts: Sequence[Mapping[str, Any]]) -> None:
+        if any(starts):
+            for start, steps in zip(starts, self._optimal_steps().tolist(), strict=True):
+                if start:
+                    refuse_solved(start, steps)
 
     @abstractmethod
     def _state_of(self, row: int) -> dict[str, Any]:
@@ -299,9 +331,10 @@ class PlanningVectorEnv(DomainVectorEnv):
 
     def _checked(self, actions: NDArray[Any]) -> NDArray[Any]:
         n_actions = self.single_action_space.n  # type: ignore[attr-defined]
-        if actions.shape != (self.num_envs,) or actions.min() < 0 or actions.max() >= n_actions:
+        whole = np.issubdtype(actions.dtype, np.integer)
+        if not whole or actions.shape != (self.num_envs,) or actions.min() < 0 or actions.max() >= n_actions:
             raise ValueError(
-                f"actions of shape {actions.shape} and values {actions!r} are not accepted; "
+                f"actions of shape {actions.shape}, type {actions.dtype} and values {actions!r} are not accepted; "
                 f"needed: shape ({self.num_envs},), integers from 0 to {n_actions - 1}"
             )
         return actions

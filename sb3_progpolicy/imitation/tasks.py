@@ -7,6 +7,7 @@ from typing import Any
 from progpolicy_envs import find_domain
 from sb3_progpolicy.imitation.rollouts import Variations
 from sb3_progpolicy.names import Names, readable_names
+from sb3_progpolicy.reptile.options import refuse_starts
 
 
 def training_variations(env_id: str, tasks: Variations | None) -> tuple[Variations, list[int]]:
@@ -14,11 +15,12 @@ def training_variations(env_id: str, tasks: Variations | None) -> tuple[Variatio
 
     :param env_id: environment id
     :param tasks: variations, the easiest first; by default those that the domain is trained on
-    :raises ValueError: if there are none
+    :raises ValueError: if there are none, or one gives a part of a start
     """
     domain = find_domain(env_id)
     if tasks is not None and not len(tasks):
         raise ValueError("tasks=[] is not accepted; at least one variation, such as {}, is needed")
+    refuse_starts(env_id, tasks or ())
     variations: Variations = list(tasks) if tasks is not None else list(domain.train) if domain is not None else [{}]
     if domain is None or not all(domain.size in variation for variation in variations):
         return variations, [0] * len(variations)

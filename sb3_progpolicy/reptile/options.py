@@ -81,6 +81,25 @@ def refuse_unread(options: Iterable[Any], env: str) -> None:
         raise ValueError(f"the reset option {', '.join(sorted(unread))} has no effect; {env} does not read it")
 
 
+def refuse_starts(env_id: str | None, variations: Iterable[Mapping[str, Any]]) -> None:
+    """Raise an error if a variation of a domain gives a part of a start, which holds for one episode alone.
+
+    :param env_id: environment id, where it is known
+    :param variations: that are to hold for several episodes
+    :raises ValueError: naming the parts and the parameters that a variation can have
+    """
+    domain = find_domain(env_id)
+    space = None if domain is None else domain.space
+    if space is None:
+        return
+    for variation in variations:
+        if given := sorted(set(variation) & set(space.starts)):
+            raise ValueError(
+                f"{dict(variation)} is not accepted for several episodes; {', '.join(given)} is part of a start, which "
+                f"holds for one. A variation has values for {', '.join(space)}"
+            )
+
+
 def split_variation(
     env_id: str, variation: Mapping[str, Any], env_kwargs: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[str, Any]]:

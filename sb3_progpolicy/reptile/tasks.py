@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from progpolicy_envs import find_domain
-from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, unread_names
+from sb3_progpolicy.reptile.options import ReadOptions, constructor_arguments, refuse_starts, unread_names
 from sb3_progpolicy.reptile.samplers import CurriculumSampler, FailureSampler, Sampler, UniformSampler, make_sampler
 from sb3_progpolicy.vec_env.repeat import repeat_options
 
@@ -289,11 +289,12 @@ def make_tasks(
     :param env_id: environment id, where it is known
     :param fit: whether it is to have the form that has an effect on this environment, see ``TaskDistribution.fit_to``
     :param env_kwargs: constructor arguments of the environment
-    :raises ValueError: if the tasks set what the constructor's arguments set
+    :raises ValueError: if the tasks set what the constructor's arguments set, or parts of a start
     """
     if tasks is None:
         tasks = default_tasks(env_id)
     tasks = tasks if isinstance(tasks, TaskDistribution) else TaskDistribution(tasks)
+    refuse_starts(env_id, tasks.variations)
     if both := sorted(set(env_kwargs or {}) & set().union(*tasks.variations)):
         raise ValueError(
             f"env_kwargs sets {', '.join(both)}, which the tasks set, too: {tasks.variations[0]} is one of them. Give "

@@ -18,7 +18,8 @@ class BatchedVecEnv(VecEnv):
 
     ``get_attr``, ``set_attr`` and ``env_method`` reach the attributes and methods of the batch as a whole, whatever
     indices are given. ``set_options`` takes a variation for all environments, or a list with one for each; it holds
-    from the next ``reset``. The infos of a step are empty except for environments whose episode ends.
+    from the next ``reset``. The infos of a step are empty except for environments whose episode ends. After such an end
+    ``reset_infos`` have the new episode's variation, and not its ``optimal_steps``, which the batch is asked for.
 
     :param env: a vector environment whose autoreset mode is ``SAME_STEP``
     :raises ValueError: for another autoreset mode
@@ -37,8 +38,13 @@ class BatchedVecEnv(VecEnv):
         """Reset every environment, with the seeds and options given since the last reset."""
         seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
         names = {name for options in self._options for name in options}
-        # A batch takes every option for all environments. Those that were not given it keep their present value.
+        # A batch takes every option for all environments. Those that were not given it keep their present value, and a
+        # part of a start that they were not given is drawn.
         present = getattr(self.env, "row_variations", [{}] * self.num_envs)
+        space = getattr(self.env, "variations", None)
+        if space is not None:
+            drawn = dict.fromkeys(space.starts)
+            present = [{**drawn, **space.whole(variation)} for variation in present]
         rows = [{**old, **new} for old, new in zip(present, self._options, strict=True)]
         if any(not names <= set(row) for row in rows):
             raise ValueError(f"every environment needs the same option names; given: {self._options}")
@@ -59,12 +65,22 @@ class BatchedVecEnv(VecEnv):
         dones = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for row in dones.nonzero()[0]:
+            self.reset_infos[row] = self._info_of_reset(batch, row)
             infos[row] = {
                 **_info_of_row(batch.get("final_info", batch), row),
                 "terminal_observation": batch["final_obs"][row],
                 "TimeLimit.truncated": bool(truncated[row] and not terminated[row]),
             }
         return observations, rewards.astype(np.float32), dones, infos
+
+    def _info_of_reset(self, batch: Mapping[str, Any], row: int) -> dict[str, Any]:
+        """Return the info of the reset that followed the end of an episode.
+
+        A batch of this package's domains, which has ``row_variations``, gives the variation alone: what a planner needs
+        from the new start costs as much as a step.
+        """
+        variations = getattr(self.env, "row_variations", None)
+        return _info_of_row(batch, row) if variations is None else {"variation": dict(variations[row])}
 
     def get_images(self) -> Sequence[NDArray[Any] | None]:
         """Return one picture per environment, ``None`` without a render mode."""

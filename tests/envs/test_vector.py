@@ -92,7 +92,6 @@ def compare_one_step(
     observations, rewards, terminated, truncated, infos = batched.step(actions)
     for row, env in enumerate(singles):
         observation, reward, single_terminated, single_truncated, info = env.step(actions[row])
-        single_truncated = single_truncated and not single_terminated
         assert (rewards[row], terminated[row], truncated[row]) == (reward, single_terminated, single_truncated)
         assert infos["is_success"][row] == info["is_success"]
         ended = single_terminated or single_truncated

@@ -58,7 +58,10 @@ class Camera:
         return {"scene": self.scene, "task": self.task}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(**state)  # type: ignore[misc]
+        if state["scene"].client < 0:  # closed: there is nothing to draw
+            self.scene, self.task = state["scene"], state["task"]
+        else:
+            self.__init__(**state)  # type: ignore[misc]
 
     def frame(self, focus: int) -> Frame:
         """Return a picture ``(360, 480, 3)`` of bytes.

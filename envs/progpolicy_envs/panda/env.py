@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,8 +16,9 @@ from progpolicy_envs.panda.physics import CONTROL_STEP, ObjectState, Physics
 from progpolicy_envs.panda.placement import Points
 from progpolicy_envs.panda.scene import Scene
 from progpolicy_envs.panda.tasks import Task
-from progpolicy_envs.rendering import Frame
+from progpolicy_envs.rendering import Display, Frame
 from progpolicy_envs.single import DomainEnv, require_reset
+from progpolicy_envs.states import check_choice
 from progpolicy_envs.symmetry import Permutation, Symmetry
 from progpolicy_envs.variation import Variation, VariationSpace, draw_n_done
 
@@ -52,13 +53,6 @@ def bounded_box(size: int) -> spaces.Box:
     return spaces.Box(-BOUND, BOUND, (size,), np.float32)
 
 
-def check_choice(name: str, value: Any, choices: Sequence[Any]) -> None:
-    """Raise ``ValueError`` if an argument is not one of the choices."""
-    if value not in choices:
-        allowed = ", ".join(repr(choice) for choice in choices)
-        raise ValueError(f"{name}={value!r} is not accepted; {name} is one of {allowed}")
-
-
 class PandaEnv(DomainEnv):
     """What the Panda environments have in common; see :class:`~progpolicy_envs.panda.PandaPushEnv` and the others.
 
@@ -85,14 +79,19 @@ class PandaEnv(DomainEnv):
         context: str = "hidden",
     ) -> None:
         check_choice("reward_type", reward_type, REWARD_TYPES)
-        check_choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
+        if not isinstance(physics, Physics | None):
+            raise ValueError(f"physics={physics!r} is not accepted; it is a Physics, or None for the default")
         super().__init__(variation, self._observed_space(), render_mode, context)
         self.reward_type = reward_type
         self.action_space = spaces.Box(-1.0, 1.0, (len(ACTION_NAMES),), np.float32)
         self.task = self.task_class()
         self.scene = Scene(self.task.table, self.task.kind, physics, visual=render_mode is not None)
+        # Frames are shown in the time that they last.
+        self.metadata = {**self.metadata, "render_fps": round(1 / self.scene.physics.control_step)}
+        self._display = Display(self.metadata["render_fps"])
         self._camera = Camera(self.scene, self.task) if render_mode is not None else None
         self._approach_distance = self._potential = 0.0
+        self._failed = False
 
     def _observed_space(self) -> spaces.Space[Any]:
         """Return the space of observations, without the variation's numbers."""
@@ -125,7 +124,7 @@ class PandaEnv(DomainEnv):
         self.scene.sync_state()
         task.update(self.scene)
         by_potential = self.reward_type == "potential"
-        failure = task.failed or (by_potential and task.out_of_reach)
+        failure = self._failed = task.failed or (by_potential and task.out_of_reach)
         shaping = self._potential_shaping(failure) if by_potential else self._dense_shaping(failure)
         if self._focus != index:
             achieved = self._achieved  # the new object has made no progress yet
@@ -191,6 +190,12 @@ class PandaEnv(DomainEnv):
         :return: the observation
         :raises ValueError: if they are not accepted
         """
+        require_reset(self._started, "replace_start()")
+        if unknown := sorted(set(start) - set(self.variations.starts)):
+            raise ValueError(f"{unknown} are not parts of a start; its parts are {', '.join(self.variations.starts)}")
+        return self._replace_start(start)
+
+    def _replace_start(self, start: Mapping[str, Any]) -> Observation:
         task = self.task
         given = {"starts": task.starts, "targets": task.targets, **start}
         read = task.read_start(len(task.targets), given["starts"], given["targets"], task.n_done)
@@ -210,17 +215,18 @@ class PandaEnv(DomainEnv):
         super().close()
 
     def _planned(self) -> Iterator[Action]:
-        while self._n_left and not self.task.failed:
+        while self._n_left and not self._failed:
             yield type(self).controller(self._flat_observation())
 
     def _start(self, variation: Variation, start: Mapping[str, Any]) -> None:
         starts, targets = self.task.sample(self.np_random, variation[self._size])
         self._place(starts, targets, draw_n_done(variation, self._size, self.np_random))
         if start:
-            self.replace_start(start)
+            self._replace_start(start)
 
     def _place(self, starts: Points, targets: Points, n_done: int, neutral: bool = False) -> Observation:
         """Begin an episode; see :meth:`Task.place`. Return its observation."""
+        self._failed = False
         self.task.place(self.scene, starts, targets, n_done, neutral)
         self._update_focus()
         return self._observation()

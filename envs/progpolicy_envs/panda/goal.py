@@ -41,11 +41,17 @@ class PandaGoalEnv(PandaEnv, GoalEnv):
         :param desired_goal: like ``achieved_goal``
         :param info: the step's info, or a sequence of ``n``
         :return: one number or ``(n,)``
-        :raises ValueError: for the dense reward, if an info lacks ``"previous_achieved_goal"`` or ``"shaping"``
+        :raises ValueError: if the numbers of goals and infos differ; for other rewards than the sparse one, if an info
+            lacks ``"previous_achieved_goal"`` or ``"shaping"``
         """
-        one = isinstance(info, Mapping)
-        infos: Sequence[Mapping[str, Any]] = [info] if one else info  # type: ignore[list-item, assignment]
+        one = np.ndim(achieved_goal) < 2
         achieved, desired = np.atleast_2d(achieved_goal), np.atleast_2d(desired_goal)
+        infos: Sequence[Mapping[str, Any]] = [info] if isinstance(info, Mapping) else info
+        if np.shape(achieved_goal) != np.shape(desired_goal) or len(infos) != len(achieved):
+            raise ValueError(
+                f"achieved_goal of shape {np.shape(achieved_goal)}, desired_goal of shape {np.shape(desired_goal)} and "
+                f"{len(infos)} infos are not accepted; they are (3,) and one info, or (n, 3) and n infos"
+            )
         distance = np.linalg.norm(achieved - desired, axis=-1)
         if self.reward_type == "sparse":
             settled = np.array([entry.get("settled", True) for entry in infos], dtype=bool)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Literal, NamedTuple
 
 MAX_OBJECTS = 8
@@ -35,6 +37,7 @@ class Physics:
     :param stock_bodies: whether table and objects are PyBullet's default, as in panda-gym: multibodies, each a box or a
         cylinder. Otherwise the table, and every object whose kind does not ask for a multibody, are rigid bodies, with
         shapes that do not sink in when they slide
+    :raises ValueError: if a number is not accepted
     """
 
     frequency: int = 120
@@ -45,6 +48,15 @@ class Physics:
     sleeping: bool = True
     contact_margin: float = 0.005
     stock_bodies: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("frequency", "substeps", "solver_iterations", "delicate_substeps", "delicate_iterations"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
+                raise ValueError(f"{name}={value!r} is not accepted; it is a whole number of at least 1")
+        margin = self.contact_margin
+        if isinstance(margin, bool) or not isinstance(margin, Real) or not 0 <= margin < math.inf:
+            raise ValueError(f"contact_margin={margin!r} is not accepted; it is a number of metres of at least 0")
 
     @property
     def control_step(self) -> float:

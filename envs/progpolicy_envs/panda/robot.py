@@ -51,6 +51,18 @@ def motor_gain(time_step: float) -> float:
     return 1 - (1 - _GAIN_AT_240_HZ) ** (240 * time_step)
 
 
+def beyond_reach(x: float, y: float, z: float) -> float:
+    """Return how far a place at least stays from the gripper, wherever the arm goes, metres; 0 within its reach.
+
+    :param x: metres
+    :param y: metres
+    :param z: metres above the table
+    """
+    out = math.hypot(x - BASE_POSITION[0], y - BASE_POSITION[1])
+    span = math.hypot(max(NEAREST, out) - _WRIST, z + _HAND - _SHOULDER)
+    return max(NEAREST - out, span - _TO_ELBOW - _TO_WRIST, 0.0)
+
+
 def arm_angles(x: float, y: float, z: float) -> list[float]:
     """Return the arm's joint angles that bring the gripper to a place, pointing down, its fingers opening along y.
 

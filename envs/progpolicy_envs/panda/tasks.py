@@ -26,7 +26,7 @@ from progpolicy_envs.panda.placement import (
     sample_in_order,
 )
 from progpolicy_envs.panda.potential import way_behind, way_onto
-from progpolicy_envs.panda.robot import BASE_POSITION, MAX_WIDTH
+from progpolicy_envs.panda.robot import BASE_POSITION, MAX_WIDTH, beyond_reach
 from progpolicy_envs.panda.scene import Scene
 from progpolicy_envs.panda.task import DISC, Mark, Task
 
@@ -92,11 +92,17 @@ class Reach(Task):
         :param starts: not used
         :param targets: x, y and z of each target, metres
         :param n_done: not used
-        :raises ValueError: if they are not of that form, or below the table's top
+        :raises ValueError: if they are not of that form, below the table's top, or out of the arm's reach
         """
         points = read_points("targets", targets, np.full(n_objects, np.nan))
         if (points[:, 2] < 0).any():
             raise ValueError(f"targets={points.tolist()} are not accepted; z is above the table, at least 0")
+        for point in points.tolist():
+            if (beyond := beyond_reach(*point)) > self.tolerance:
+                raise ValueError(
+                    f"targets={points.tolist()} are not accepted; the gripper comes no nearer to {point} than "
+                    f"{beyond:.2f} m, and {self.tolerance} m is near enough"
+                )
         return np.zeros((0, 3)), points
 
     def mark_positions(self, index: int) -> tuple[Point | None, ...]:

@@ -105,7 +105,7 @@ class PandaVectorEnv(DomainVectorEnv):
         for row in rows:
             env = self.envs[row]
             env.np_random = self._generators[row]
-            self._observations[row] = env.reset(options=dict(self.row_variations[row]))[0]
+            self._observations[row] = env.reset(options=self.variations.whole(self.row_variations[row]))[0]
 
     def _set_start(self, row: int, start: Mapping[str, Any]) -> None:
         self._observations[row] = self.envs[row].replace_start(start)

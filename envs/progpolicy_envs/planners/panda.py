@@ -12,6 +12,7 @@ Action = NDArray[np.float32]
 
 _STEP = 0.05  # metres per unit of action
 _OPEN, _CLOSE = 1.0, -1.0
+_EMPTY = 0.03  # width between the fingers, metres, with which there is no block between them
 _CLEAR = 0.1  # height at which the gripper passes over everything that lies on the table
 
 
@@ -130,7 +131,12 @@ def _holds(view: _View) -> bool:
 
 
 def _leave(view: _View) -> Action:
-    """Open the fingers, then rise, slowly as long as the object is between them: a jerk would drag it along."""
+    """Open the fingers, then rise, slowly as long as the object is between them: a jerk would drag it along.
+
+    Fingers with nothing between them stay closed: opening, they would hit what lies beside the hand.
+    """
+    if view.width < _EMPTY:
+        return _action(0.0, 0.0, _STEP, _CLOSE)
     around = view.reach < 0.03 and abs(view.to_object[2]) < 0.03
     return _action(0.0, 0.0, (0.02 if around else _STEP) if view.width > 0.06 else 0.0, _OPEN)
 
