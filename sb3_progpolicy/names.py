@@ -72,3 +72,17 @@ def _fitting(own: Sequence[Any] | None, known: tuple[str, ...], kind: str, numbe
         if len(names) == number:
             return names
     return tuple(f"{kind}[{index}]" for index in range(number))
+
+
+def check_ignored(ignore: Sequence[str], inputs: Sequence[str], default: Sequence[str] = ()) -> None:
+    """Check the names of inputs that are not to be read.
+
+    :param ignore: the names
+    :param inputs: names of all
+    :param default: names that may be missing
+    :raises ValueError: if there is no input of a name, or none is left
+    """
+    if missing := [name for name in ignore if name not in inputs and name not in default]:
+        raise ValueError(f"ignore: there is no input {', '.join(missing)}; the inputs are {', '.join(inputs)}")
+    if set(inputs) <= set(ignore):
+        raise ValueError(f"ignore={tuple(ignore)} is not accepted: it leaves no input")

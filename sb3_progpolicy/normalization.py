@@ -24,9 +24,10 @@ class NormalizingExtractor(BaseFeaturesExtractor):
     The map is affine and unclipped, so that it can be folded into a program's weights.
 
     :param observation_space: a one-dimensional Box
+    :param ignored: indices of numbers that are 0 in what it returns, so that nothing that reads it depends on them
     """
 
-    def __init__(self, observation_space: spaces.Box) -> None:
+    def __init__(self, observation_space: spaces.Box, ignored: Sequence[int] = ()) -> None:
         n_features = int(np.prod(observation_space.shape))
         super().__init__(observation_space, n_features)
         self.mean: th.Tensor
@@ -36,19 +37,27 @@ class NormalizingExtractor(BaseFeaturesExtractor):
         self.register_buffer("variance", th.ones(n_features, dtype=th.float64))
         self.register_buffer("count", th.tensor(EPSILON, dtype=th.float64))
         self._group: Sequence[Permutation] = ()
+        read = th.ones(n_features, dtype=th.float64)
+        read[list(ignored)] = 0
+        self._read: th.Tensor
+        self.register_buffer("_read", read, persistent=False)
 
     def tie(self, group: Sequence[Permutation]) -> None:
         """Keep the statistics those of all images of the observations, so that a tied program stays one.
 
         :param group: how its members move the observation
+        :raises ValueError: if a number that is ignored has an image that is not
         """
+        for one in group:
+            if not th.equal(self._read[list(one.source)], self._read):
+                raise ValueError("ignored inputs have images under the symmetries that are not; ignore these, too")
         self._group = tuple(group)
 
     @property
     def scale(self) -> th.Tensor:
-        """Return ``1 / standard deviation``; 1 where a number has never changed."""
+        """Return ``1 / standard deviation``; 1 where a number has never changed, and 0 where it is ignored."""
         deviation = (self.variance + EPSILON).sqrt()
-        return th.where(self.variance > EPSILON, 1 / deviation, 1.0)
+        return th.where(self.variance > EPSILON, 1 / deviation, 1.0) * self._read
 
     def update(self, observations: NDArray[np.floating] | th.Tensor) -> None:
         """Take in a batch.

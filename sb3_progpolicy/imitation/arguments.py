@@ -111,17 +111,3 @@ def _checked_path(checkpoint: str | os.PathLike[str] | None, recurrent: str | No
     if not path.parent.is_dir():
         raise ValueError(f"checkpoint={str(checkpoint)!r} is not accepted: there is no folder {path.parent}")
     return path
-
-
-def check_ignored(ignore: Sequence[str], inputs: Sequence[str], default: Sequence[str]) -> None:
-    """Check the names of inputs that a program must not read.
-
-    :param ignore: the names
-    :param inputs: of the program
-    :param default: names that may be missing
-    :raises ValueError: if there is no input of a name, or none is left
-    """
-    if missing := [name for name in ignore if name not in inputs and name not in default]:
-        raise ValueError(f"ignore: there is no input {', '.join(missing)}; the inputs are {', '.join(inputs)}")
-    if set(inputs) <= set(ignore):
-        raise ValueError(f"ignore={tuple(ignore)} is not accepted: it leaves no input")

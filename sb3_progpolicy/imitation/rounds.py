@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from sb3_progpolicy.imitation.actions import ActionCodec
-from sb3_progpolicy.imitation.arguments import check_ignored
 from sb3_progpolicy.imitation.augmentation import Augment, make_augmentation
 from sb3_progpolicy.imitation.conversion import DIGITS, make_program, rounded, to_program
 from sb3_progpolicy.imitation.decision_list import DecisionList
@@ -23,6 +22,7 @@ from sb3_progpolicy.imitation.selection import Selection
 from sb3_progpolicy.imitation.tasks import names_of, training_variations, validation_variations
 from sb3_progpolicy.imitation.teachers import Teacher, TeacherLike, make_teacher
 from sb3_progpolicy.imitation.visits import Collector
+from sb3_progpolicy.names import check_ignored
 from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.programs.syntax import Expression
 from sb3_progpolicy.spaces import action_spec

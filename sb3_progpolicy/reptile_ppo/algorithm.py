@@ -109,6 +109,8 @@ class ReptilePPO(StoredPPO):
     :param interaction_history: append previous action, reward and done to the observation
     :param normalize_observations: shift and scale observations by running statistics, which are folded into the program
         that is extracted; by default for a program, and not for a network
+    :param ignore: names of inputs that neither actor nor critic reads, such as one that has other values in the
+        variations that are never seen; needs normalised observations
     :param scale_rewards: divide rewards by the running deviation of the return
     :param timeouts: where a limit of steps cuts an episode short, ``"bootstrap"`` adds the value of its last state, as
         PPO does; ``"terminal"`` adds nothing, so that not to reach a goal in time is to fail (Pardo et al., 2018)
@@ -169,6 +171,7 @@ class ReptilePPO(StoredPPO):
         symmetric: bool = False,
         interaction_history: bool = True,
         normalize_observations: bool | None = None,
+        ignore: Sequence[str] = (),
         scale_rewards: bool = False,
         timeouts: Timeouts = "bootstrap",
         stats_window_size: int = 100,
@@ -203,13 +206,13 @@ class ReptilePPO(StoredPPO):
         self.symmetric, policy_kwargs = symmetric, dict(policy_kwargs or {})
         if symmetric and "symmetries" not in policy_kwargs:
             policy_kwargs["symmetries"] = symmetries_of(self.env_id, venv)
-        about = (self._initial_program, normalize_observations, interaction_history)
-        policy_kwargs = complete_policy_kwargs(policy_kwargs, policy_class, *about)
+        names = (None, None) if venv is None else program_names(venv)
+        self.ignore, about = list(ignore), (self._initial_program, normalize_observations, interaction_history)
+        policy_kwargs = complete_policy_kwargs(policy_kwargs, policy_class, *about, self.ignore, names[0])
         self.inner_updates, self.tasks_per_iteration, self.meta_iteration = inner_updates, tasks_per_iteration, 0
         self.meta_optimizer, self.meta_update, self.meta_learning_rate = meta_optimizer, meta_update, meta_learning_rate
         self.search_method, self.search_fraction = search_method, search_fraction
         self.growth_iterations, self.normalize_observations = growth_iterations, normalize_observations
-        names = (None, None) if venv is None else program_names(venv)
         self.input_names: tuple[str, ...] | None = names[0]
         self.output_names: tuple[str, ...] | None = names[1]
         self.wrappers: tuple[str, ...] = () if venv is None else wrappers_of(venv)

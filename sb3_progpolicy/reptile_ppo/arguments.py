@@ -46,6 +46,9 @@ def check_arguments(given: Mapping[str, Any]) -> None:
     for name in _FLAGS:
         if not isinstance(given[name], bool):
             raise ValueError(f"{name}={given[name]!r} is not accepted; it is True or False")
+    ignore = given["ignore"]
+    if isinstance(ignore, str) or not all(isinstance(name, str) for name in ignore):
+        raise ValueError(f"ignore={ignore!r} is not accepted; it is a sequence of names of inputs, such as ('left',)")
     if given["max_episode_steps"] is not None and "max_episode_steps" in (given["env_kwargs"] or {}):
         raise ValueError("max_episode_steps is given twice, as an argument and in env_kwargs; give one of them")
 

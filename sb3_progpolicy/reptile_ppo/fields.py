@@ -90,6 +90,7 @@ ARGUMENTS: Mapping[str, Check] = {
     "symmetric": _flag,
     "interaction_history": _flag,
     "normalize_observations": _flag,
+    "ignore": _all(_text),
     "scale_rewards": _flag,
     "timeouts": _text,
     "stats_window_size": _count,

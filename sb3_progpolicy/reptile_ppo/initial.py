@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_wr
 
 from sb3_progpolicy.differentiable.initial import put_program, shape_of
 from sb3_progpolicy.interaction import appends_history
+from sb3_progpolicy.names import check_ignored
 from sb3_progpolicy.normalization import NormalizingExtractor
 from sb3_progpolicy.policies import ProgrammaticActorCritic
 from sb3_progpolicy.pretrained import load_pretrained
@@ -80,6 +81,8 @@ def complete_policy_kwargs(
     program: Program | None,
     normalize_observations: bool,
     interaction_history: bool,
+    ignore: Sequence[str] = (),
+    input_names: Sequence[str] | None = None,
 ) -> dict[str, Any]:
     """Return the arguments of a new model's policy: the user's and those that the model's own arguments ask for.
 
@@ -88,6 +91,8 @@ def complete_policy_kwargs(
     :param program: from :func:`read_initial_program`
     :param normalize_observations: whether the policy normalises what it reads
     :param interaction_history: whether the history is appended to observations
+    :param ignore: names of inputs that are not to be read
+    :param input_names: of all inputs; ``None`` where they are not known, as in loading, when the arguments are
     :raises ValueError: if they do not go together
     """
     if given.get("persistence_init") and not interaction_history:
@@ -98,6 +103,12 @@ def complete_policy_kwargs(
     completed = dict(given)
     if normalize_observations:
         completed.setdefault("features_extractor_class", NormalizingExtractor)
+    if ignore and input_names is not None:
+        check_ignored(ignore, input_names)
+        if completed.get("features_extractor_class") is not NormalizingExtractor:
+            raise ValueError(f"ignore={tuple(ignore)} is not accepted with normalize_observations=False")
+        ignored = [index for index, name in enumerate(input_names) if name in ignore]
+        completed["features_extractor_kwargs"] = {**completed.get("features_extractor_kwargs", {}), "ignored": ignored}
     return completed if program is None else initial_policy_kwargs(program, policy, completed)
 
 

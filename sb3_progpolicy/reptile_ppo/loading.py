@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 #: What loading cannot change, because parameters or statistics depend on it.
 FIXED = (
     *("policy", "policy_kwargs", "meta_optimizer"),
-    *("interaction_history", "normalize_observations", "scale_rewards", "symmetric", "search_method"),
+    *("interaction_history", "normalize_observations", "ignore", "scale_rewards", "symmetric", "search_method"),
 )
 #: What else loading can change; the number of environments is among the state, the sampler is that of the tasks.
 _NOT_STORED = ("n_envs", "sampler")
