@@ -1,6 +1,7 @@
 """What training and evaluation must not pass over: arguments, options, shapes, files."""
 
 import json
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_progpolicy import ReptilePPO, ReptileWrapper, evaluate_model, evaluate_program, load_pretrained
 from sb3_progpolicy.cli import run
@@ -93,6 +94,26 @@ def test_options_that_are_given_replace_those_before():
     ours = make_vec_env("Hanoi-v0", 1)
     repeat_options(ours)
     assert not any(ours.env_is_wrapped(RepeatOptions))
+
+
+def small_pushes():
+    return gym.make("CartPole-v1")
+
+
+def small_pushes_repeated():
+    return RepeatOptions(small_pushes())
+
+
+def test_options_of_environments_in_other_processes_are_not_lost_silently():
+    venv = SubprocVecEnv([small_pushes], start_method="fork")
+    with pytest.warns(UserWarning, match="loses them when an episode ends; make each of them as RepeatOptions"):
+        repeat_options(venv)
+    venv.close()
+    venv = SubprocVecEnv([small_pushes_repeated], start_method="fork")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        repeat_options(venv)
+    venv.close()
 
 
 def test_constructor_arguments_that_tasks_set_too_are_refused():

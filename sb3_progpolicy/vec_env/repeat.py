@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import gymnasium as gym
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from progpolicy_envs import find_domain
 
@@ -31,11 +32,21 @@ def repeat_options(venv: VecEnv) -> None:
     """Wrap environments that are stepped one by one in :class:`RepeatOptions`, unless they are of a domain or wrapped.
 
     The domains' keep a variation in force by themselves. Those in other processes or of one batch cannot be wrapped
-    from here.
+    from here; a warning says so for SB3's.
 
     :param venv: environments, whose ``envs`` are replaced
     """
     bare: Any = venv.unwrapped
+    if isinstance(bare, SubprocVecEnv):
+        ids = [getattr(spec, "id", None) for spec in bare.get_attr("spec")]
+        wrapped = bare.env_is_wrapped(RepeatOptions)
+        if any(not is_wrapped and find_domain(name) is None for name, is_wrapped in zip(ids, wrapped, strict=True)):
+            warnings.warn(
+                "environments of a SubprocVecEnv get their reset options once, and one that reads them for a single "
+                "reset, as Gymnasium's do, loses them when an episode ends; make each of them as RepeatOptions(env) "
+                "(sb3_progpolicy.vec_env.repeat), or use a DummyVecEnv",
+                stacklevel=2,
+            )
     if not isinstance(bare, DummyVecEnv):
         return
     for row, env in enumerate(bare.envs):
