@@ -67,9 +67,9 @@ def train(env_id: str, seed: int, folder: Path, overrides: dict[str, Any]) -> Pr
         model, _ = build_model(config)
     try:
         train_run(model, config, run, options=TrainingOptions(save_freq=SAVE_FREQ), callbacks=[clock])
+        program = model.program(hyperparams=settings, train_seconds=clock.seconds)  # type: ignore[attr-defined]
     finally:
         model.get_env().close()  # type: ignore[union-attr]
-    program = model.program(hyperparams=settings, train_seconds=clock.seconds)  # type: ignore[attr-defined]
     program.save(path)
     shutil.rmtree(run)
     return program
