@@ -24,7 +24,7 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_progpolicy.experiment.config import RunConfig, make_config
-from sb3_progpolicy.experiment.folder import CONFIG, describe_run
+from sb3_progpolicy.experiment.folder import CONFIG, MODEL, describe_run, load_model, timesteps_of
 from sb3_progpolicy.experiment.run import TrainingOptions, build_model, resume
 from sb3_progpolicy.experiment.run import train as train_run
 from sb3_progpolicy.hyperparams import parse_value
@@ -59,6 +59,11 @@ def train(env_id: str, seed: int, folder: Path, overrides: dict[str, Any]) -> Pr
         return program
     th.set_num_threads(1)
     run, clock = folder / f"seed_{seed}_{digest}", _Clock(folder / f"seed_{seed}_{digest}" / "processor_seconds")
+    trained = timesteps_of(run / MODEL) if (run / MODEL).exists() else None
+    if trained is not None and trained >= config.n_timesteps:  # killed between its end and its program
+        program = load_model(run / MODEL).program(hyperparams=settings, train_seconds=clock.seconds)  # type: ignore[attr-defined]
+        program.save(path)
+        return program
     if (run / CONFIG).exists():
         model, _ = resume(run)
     else:
