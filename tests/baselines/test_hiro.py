@@ -14,6 +14,7 @@ from sb3_progpolicy import HIRO
 from sb3_progpolicy.baselines.hiro.buffer import GoalReplayBuffer, Segments
 from sb3_progpolicy.baselines.hiro.goals import candidate_goals, goal_transition, intrinsic_reward, scaled
 from sb3_progpolicy.baselines.hiro.learning import low_batch, relabelled_goals
+from sb3_progpolicy.interaction import VecInteractionHistory
 
 SMALL = {
     "learning_starts": 40,
@@ -272,6 +273,17 @@ def test_saved_model_predicts_and_learns_on_alike(tmp_path, discrete):
     loaded.load_replay_buffer(tmp_path / "buffer")
     loaded.learn(20, reset_num_timesteps=False)
     assert loaded.replay_buffer.size() == 110
+
+
+def test_model_with_a_history_is_loaded_without_an_environment(tmp_path):
+    agent = model(VecInteractionHistory(make_vec_env(lambda: Line(True), 2, seed=0)), goal_scale="auto").learn(80)
+    assert agent.policy.goal_dims.tolist() == [0, 1]  # of seven numbers
+    agent.save(tmp_path / "model")
+    loaded = HIRO.load(tmp_path / "model", device="cpu")
+    observation = np.ones((1, 7), np.float32)
+    actions = [one.predict(observation, deterministic=True)[0] for one in (loaded, agent)]
+    np.testing.assert_array_equal(*actions)
+    assert loaded.policy.goal_dims.tolist() == [0, 1]
 
 
 def test_networks_may_be_named_again_in_loading(tmp_path):

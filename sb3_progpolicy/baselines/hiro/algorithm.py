@@ -205,10 +205,7 @@ class HIRO(OffPolicyAlgorithm):
     def _checked_dims(self) -> list[int]:
         assert self.observation_space.shape is not None
         size = self.observation_space.shape[0]
-        history = 0
-        if self.env is not None and appends_history(self.env):
-            history = action_spec(self.action_space).interaction_size
-        dims = list(range(size - history)) if self.goal_dims is None else list(self.goal_dims)
+        dims = list(range(self._n_default_dims(size)) if self.goal_dims is None else self.goal_dims)
         whole = all(isinstance(dim, (int, np.integer)) and 0 <= dim < size for dim in dims)
         if not dims or not whole or len(set(dims)) < len(dims):
             raise ValueError(
@@ -216,6 +213,13 @@ class HIRO(OffPolicyAlgorithm):
                 f"observation, from 0 to {size - 1}"
             )
         return [int(dim) for dim in dims]
+
+    def _n_default_dims(self, size: int) -> int:
+        """Return how many numbers of the observation goals address by default: those before an interaction history."""
+        if (saved := (self.replay_buffer_kwargs or {}).get("n_goal_dims")) is not None:
+            return int(saved)  # of a model that is loaded, perhaps without an environment that would show the history
+        appended = self.env is not None and appends_history(self.env)
+        return size - action_spec(self.action_space).interaction_size if appended else size
 
     def _checked_scale(self, n_dims: int) -> th.Tensor | None:
         """Return the scale given, ``(n_dims,)``, or ``None`` for ``"auto"``."""
