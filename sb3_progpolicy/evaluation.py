@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_wr
 
 from progpolicy_envs import find_domain
 from sb3_progpolicy.bounds import check_whole
-from sb3_progpolicy.env_ids import id_from_file, spec_of
+from sb3_progpolicy.env_ids import env_to_act_in, spec_of
 from sb3_progpolicy.extraction import extract_program, holds_program, wrappers_of
 from sb3_progpolicy.interaction import VecInteractionHistory
 from sb3_progpolicy.programs.interpreter import ProgramRunner, Semantics, join_inputs
@@ -100,10 +100,7 @@ def evaluate_program(
     """
     if env_kwargs is None:
         env_kwargs = own_env_kwargs(program, env_id)
-    env_id = env_id or id_from_file(program.metadata.get("env"))
-    if not env_id:
-        raise ValueError("the program does not say which environment it is for, or names a module; give env_id")
-
+    env_id = env_to_act_in(env_id, program.metadata.get("env"), "the program")
     refuse_wrappers("the program", program.metadata.get("wrappers", ()))
 
     def start(venv: VecEnv) -> Act:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from progpolicy_envs import find_domain
-from sb3_progpolicy.env_ids import id_from_file, spec_of
+from sb3_progpolicy.env_ids import same_env, spec_of
 from sb3_progpolicy.programs.syntax import ProgramData
 from sb3_progpolicy.spaces import action_spec
 
@@ -19,10 +19,10 @@ def own_env_kwargs(program: ProgramData, env_id: str | None = None) -> dict[str,
     """Return the constructor arguments of the environment that a program was trained in, as its metadata say.
 
     :param program: the program
-    :param env_id: where it is to act; there are none for another environment than its own
+    :param env_id: where it is to act, with or without a module; there are none for another environment than its own
     :raises ValueError: if the metadata hold something else
     """
-    if env_id not in (None, id_from_file(program.metadata.get("env"))):
+    if env_id is not None and not same_env(env_id, program.metadata.get("env")):
         return {}
     kwargs = program.metadata.get("env_kwargs", {})
     if not isinstance(kwargs, Mapping):
@@ -75,12 +75,14 @@ def check_fit(
         )
 
 
-def refuse_wrappers(what: str, wrappers: Sequence[str]) -> None:
+def refuse_wrappers(what: str, wrappers: Any) -> None:
     """Raise ``ValueError`` if something was trained in wrappers that an environment's id does not bring back.
 
     :param what: was trained, for the message
-    :param wrappers: see :func:`~sb3_progpolicy.extraction.wrappers_of`
+    :param wrappers: see :func:`~sb3_progpolicy.extraction.wrappers_of`; from a file it may be anything
     """
+    if not isinstance(wrappers, (list, tuple)) or not all(isinstance(name, str) for name in wrappers):
+        raise ValueError(f"wrappers={wrappers!r} of {what} is not accepted; it is a list of names")
     if wrappers:
         raise ValueError(
             f"{what} was trained in an environment wrapped in {', '.join(wrappers)}, which an id alone does not bring "

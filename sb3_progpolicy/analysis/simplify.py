@@ -17,6 +17,7 @@ from sb3_progpolicy.analysis.prune import Point, Pruned, prune
 from sb3_progpolicy.analysis.rules import Rules, count_numbers
 from sb3_progpolicy.analysis.situations import Situations, meet, meet_in
 from sb3_progpolicy.analysis.switches import disagreements, replace_switches
+from sb3_progpolicy.env_ids import env_to_act_in
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.programs.interpreter import ProgramRunner
 from sb3_progpolicy.programs.io import program_digest
@@ -129,9 +130,7 @@ def simplify(
     :raises ValueError: if an argument is not accepted
     """
     began = time.monotonic()
-    env_id = env_id or str(program.metadata.get("env") or "")
-    if not env_id:
-        raise ValueError("the program does not say which environment it is for; give env_id")
+    env_id = env_to_act_in(env_id, program.metadata.get("env"), "the program")
     if equally_good not in _CHOICES:
         raise unknown("equally_good", equally_good, _CHOICES)
     if finetune is not None and finetune < 1:

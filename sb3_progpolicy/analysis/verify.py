@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from progpolicy_envs import find_domain
 from sb3_progpolicy.analysis.checkpoint import Checkpoint
 from sb3_progpolicy.analysis.rollout import make_batch, run_episodes, start_numbers
-from sb3_progpolicy.env_ids import spec_of
+from sb3_progpolicy.env_ids import env_to_act_in, spec_of
 from sb3_progpolicy.programs.interpreter import ProgramRunner, join_inputs
 from sb3_progpolicy.programs.io import program_digest
 from sb3_progpolicy.programs.syntax import ProgramData
@@ -101,9 +101,7 @@ def verify(
     :raises ValueError: if an argument is not accepted, the program does not fit, the environment has no goal, or the
         file is of another verification
     """
-    env_id = env_id or str(program.metadata.get("env") or "")
-    if not env_id:
-        raise ValueError("the program does not say which environment it is for; give env_id")
+    env_id = env_to_act_in(env_id, program.metadata.get("env"), "the program")
     if all_starts and n_starts is not None:
         raise ValueError(f"all_starts and n_starts={n_starts} are not accepted together")
     if n_starts is not None and n_starts < 1:

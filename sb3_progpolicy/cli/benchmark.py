@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sb3_progpolicy.cli.parsing import check_folder
+from sb3_progpolicy.cli.streams import plain_console
 
 if TYPE_CHECKING:
     from sb3_progpolicy.benchmark.runner import Progress
@@ -65,7 +66,6 @@ def status(store: Annotated[str, typer.Argument(help="SQLite file or database UR
     """Show how far a suite is."""
     from collections import Counter
 
-    from rich.console import Console
     from rich.table import Table
 
     from sb3_progpolicy.benchmark.store import DONE, FAILED, RUNNING, WAITING, open_store
@@ -79,7 +79,7 @@ def status(store: Annotated[str, typer.Argument(help="SQLite file or database UR
     for method in dict.fromkeys(cell["method"] for cell in cells):
         counts = Counter(cell["status"] for cell in cells if cell["method"] == method)
         table.add_row(method, *(str(counts[kind] or "") for kind in kinds))
-    Console().print(table)
+    plain_console().print(table)
 
 
 def export(
@@ -196,11 +196,10 @@ class _Display:
     """A table that shows what is being run, what is done, what is left and when it will end."""
 
     def __init__(self, jobs: int) -> None:
-        from rich.console import Console
         from rich.live import Live
 
         self.jobs = jobs
-        self.console = Console(stderr=True)
+        self.console = plain_console(stderr=True)
         self.live = Live(console=self.console, refresh_per_second=1, transient=True)
         self._said: set[str] = set()
 

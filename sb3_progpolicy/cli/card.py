@@ -19,11 +19,16 @@ def card(
     ] = None,
     episodes: Annotated[int, typer.Option("--episodes", min=1, help="on each variation")] = 20,
     film: Annotated[bool, typer.Option("--film/--no-film", help="whether to film a program, beside the card")] = True,
+    env: Annotated[
+        str | None,
+        typer.Option("--env", help="its environment, where a module has to be imported for it, as module:Id-v0"),
+    ] = None,
     allow_pickle: Annotated[bool, typer.Option("--allow-pickle", help=ALLOW_PICKLE)] = False,
 ) -> None:
     """Write a model card: how it was trained, what it reaches on each variation, its program and a film."""
     import torch
 
+    from sb3_progpolicy.env_ids import same_env
     from sb3_progpolicy.experiment.card import write_card
     from sb3_progpolicy.experiment.sources import find_source
 
@@ -35,9 +40,11 @@ def card(
         raise ValueError(f"-o {str(output)!r} is not accepted; the file is a .md")
     check_folder(output)
     with quiet_stdout():
-        source = find_source(run_or_name, allow_pickle)
-        if source.env_id is None:
-            raise ValueError(f"{source.name} does not say which environment it is for")
+        found = find_source(run_or_name, allow_pickle)
+        if env is not None and found.named_env is not None and not same_env(env, found.named_env):
+            raise ValueError(f"--env {env} is not accepted; a card is for {found.named_env}, where it was trained")
+        source = found.within(env)
+        assert source.env_id is not None
         chosen = parse_variations(variations) if variations else default_variations(source.env_id)
         write_card(source, folder, chosen, output, episodes, film)
     typer.echo(f"Wrote {output}", err=True)

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from sb3_progpolicy.cli.parsing import ALLOW_PICKLE, check_folder, default_variations, parse_variations
-from sb3_progpolicy.cli.streams import quiet_stdout
+from sb3_progpolicy.cli.streams import plain_console, quiet_stdout
 
 
 def compare(
@@ -25,6 +25,7 @@ def compare(
     seed: Annotated[int, typer.Option("--seed", min=0, help="of the environments")] = 0,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="picture to draw, .png or .svg")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+    env: Annotated[str | None, typer.Option("--env", help="another environment than they were trained in")] = None,
     allow_pickle: Annotated[bool, typer.Option("--allow-pickle", help=ALLOW_PICKLE)] = False,
 ) -> None:
     """Evaluate several runs on the same episodes and show them side by side, as a table and as a picture.
@@ -46,10 +47,9 @@ def compare(
             raise ValueError(f"-o {str(output)!r} is not accepted; the file is a .png or an .svg")
         check_folder(output)
     with quiet_stdout():
-        sources = [find_source(name, allow_pickle) for name in runs]
+        sources = [find_source(name, allow_pickle).within(env) for name in runs]
         env_id = sources[0].env_id
-        if env_id is None:
-            raise ValueError(f"{sources[0].name} does not say which environment it is for")
+        assert env_id is not None
         chosen = parse_variations(variations) if variations else default_variations(env_id)
         compared = compare_sources(sources, chosen, episodes, seed)
         learned = [None if source.program is None else source.program.learned_by for source in sources]
@@ -74,14 +74,12 @@ def compare(
 
 
 def _print_table(compared: Any, learned: Sequence[str | None]) -> None:
-    from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
 
     first = compared[0].rows
     shown = "returns" if first[0].success_rate is None else "steps [share solved]"
-    table = Table(title=escape(f"{first[0].env}, {first[0].episodes} episode(s) each, {shown}"))
-    names = list(first[0].variation)
+    table = Table(title=f"{first[0].env}, {first[0].episodes} episode(s) each, {shown}")
+    names = list(dict.fromkeys(name for row in first for name in row.variation))
     for name in names:
         table.add_column(name)
     for run, how in zip(compared, learned, strict=True):
@@ -98,4 +96,4 @@ def _print_table(compared: Any, learned: Sequence[str | None]) -> None:
             cells.append(f"{own.steps_mean:.1f}{solved}")
         optimum = "-" if row.optimal_steps_mean is None else f"{row.optimal_steps_mean:.1f}"
         table.add_row(*(str(row.variation.get(name, "")) for name in names), *cells, optimum)
-    Console().print(table)
+    plain_console().print(table)

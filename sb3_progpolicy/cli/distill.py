@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sb3_progpolicy.cli.parsing import ALLOW_PICKLE, check_folder, parse_variations
-from sb3_progpolicy.cli.streams import quiet_stdout
+from sb3_progpolicy.cli.streams import plain_console, quiet_stdout
 
 if TYPE_CHECKING:
     from sb3_progpolicy.imitation import Comparison, Imitation
@@ -91,16 +91,13 @@ def _find_teacher(name: str, env: str | None, allow_pickle: bool) -> tuple[Any, 
         return name, env, {}
     from sb3_progpolicy.experiment.sources import find_source
 
-    source = find_source(name, allow_pickle)
-    env_id = env or source.env_id
-    if env_id is None:
-        raise ValueError(f"{name} does not say which environment it is for; give --env")
-    return source.model if source.program is None else source.program, env_id, source.env_kwargs
+    source = find_source(name, allow_pickle).within(env)
+    assert source.env_id is not None
+    return source.model if source.program is None else source.program, source.env_id, source.env_kwargs
 
 
 def _imitated(teacher: Any, env_id: str, output: Path | None, arguments: dict[str, Any]) -> Program:
     """Imitate with a progress bar; the best program so far is in a file of its own after each round."""
-    from rich.console import Console
     from rich.progress import Progress
 
     from sb3_progpolicy.imitation import imitate
@@ -108,7 +105,7 @@ def _imitated(teacher: Any, env_id: str, output: Path | None, arguments: dict[st
     keeps_state = output is not None and arguments["cell"] != "gru"
     state = output.with_suffix(".state.npz") if output is not None and keeps_state else None
     part = output.with_suffix(".part.json") if output is not None else None
-    with Progress(console=Console(stderr=True)) as progress:
+    with Progress(console=plain_console(stderr=True)) as progress:
         bar = progress.add_task(f"Imitating on {env_id}", total=None)
 
         def show(so_far: Imitation) -> None:
@@ -129,10 +126,9 @@ def _imitated(teacher: Any, env_id: str, output: Path | None, arguments: dict[st
 
 
 def _print_comparison(compared: Comparison, program: Program, episodes: int) -> None:
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    console = plain_console()
     table = Table(title=f"{episodes} episodes")
     for name in ("", "teacher", "program"):
         table.add_column(name, justify="right" if name else "left")

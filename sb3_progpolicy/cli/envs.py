@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from sb3_progpolicy.cli.streams import quiet_stdout
+from sb3_progpolicy.cli.streams import plain_console, quiet_stdout
 
 
 def envs() -> None:
     """List the environments with their parameters and their training, validation and unseen variations."""
-    from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
 
     from progpolicy_envs import DOMAINS
@@ -27,12 +25,12 @@ def envs() -> None:
             parameters = [str(error)]
         table.add_row(
             domain.id,
-            escape("\n".join(parameters)),
+            "\n".join(parameters),
             _listed(domain.train),
             _listed(domain.validation),
             _listed(domain.unseen),
         )
-    Console().print(table)
+    plain_console().print(table)
 
 
 def _parameters(env_id: str) -> Mapping[str, Any]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sb3_progpolicy.cli.parsing import ALLOW_PICKLE, default_variations, parse_variations
-from sb3_progpolicy.cli.streams import quiet_stdout
+from sb3_progpolicy.cli.streams import plain_console, quiet_stdout
 from sb3_progpolicy.experiment.sources import Source, evaluate_source, find_source
 from sb3_progpolicy.nearest import unknown
 
@@ -36,8 +36,9 @@ def evaluate(
 ) -> None:
     """Measure success and steps on variations, next to the steps of the domain's planner.
 
-    An episode that fails counts as the cap, 500 steps. Without --set: the domain's training sizes and all larger ones.
-    Where the environment reports no success: returns and lengths of episodes.
+    An episode that fails counts as the cap: --max-steps, or else the environment's limit of steps. Without --set: the
+    domain's training sizes and all larger ones. Where the environment reports no success: returns and lengths of
+    episodes.
     """
     if semantics not in (*SEMANTICS, "both"):
         raise unknown("semantics", semantics, (*SEMANTICS, "both"))
@@ -63,16 +64,14 @@ def _evaluate(
     import torch
 
     torch.set_num_threads(1)
-    env_id = env or source.env_id
-    if env_id is None:
-        raise ValueError(f"{source.name} does not say which environment it is for; give --env")
-    chosen = parse_variations(pairs) if pairs else default_variations(env_id)
+    source = source.within(env)
+    assert source.env_id is not None
+    chosen = parse_variations(pairs) if pairs else default_variations(source.env_id)
     kinds = [kind for kind in SEMANTICS if semantics in (kind, "both")]
-    return evaluate_source(source, chosen, episodes, kinds, env_id, seed=seed, max_steps=max_steps)
+    return evaluate_source(source, chosen, episodes, kinds, seed=seed, max_steps=max_steps)
 
 
 def _print_table(rows: list[Evaluation], caption: str | None) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     table = Table(title=f"{rows[0].env}, {rows[0].episodes} episode(s) each", caption=caption)
@@ -99,7 +98,7 @@ def _print_table(rows: list[Evaluation], caption: str | None) -> None:
             "-" if row.optimal_steps_mean is None else f"{row.optimal_steps_mean:g}",
             "-" if row.ratio is None else f"{row.ratio:.2f}",
         )
-    Console().print(table)
+    plain_console().print(table)
 
 
 def _with_deviation(mean: float, deviation: float) -> str:

@@ -27,6 +27,7 @@ def render(
     seed: Annotated[int, typer.Option("--seed", min=0, help="of the environment")] = 0,
     fps: Annotated[int | None, typer.Option("--fps", min=1, max=50, help="frames per second")] = None,
     max_steps: Annotated[int | None, typer.Option("--max-steps", min=1, help="cap of the episode")] = None,
+    env: Annotated[str | None, typer.Option("--env", help="another environment than it was trained in")] = None,
     allow_pickle: Annotated[bool, typer.Option("--allow-pickle", help=ALLOW_PICKLE)] = False,
 ) -> None:
     """Play one episode and write it as an animated GIF or an MP4 film."""
@@ -41,9 +42,9 @@ def render(
         raise ValueError("--semantics is for programs; neither a planner nor drawn actions have one")
     with quiet_stdout():
         actor = "planner" if planner else "random" if random else "policy"
-        source = find_source(run_or_name, allow_pickle) if actor == "policy" else environment_of(run_or_name)
-        if source.env_id is None:
-            raise ValueError(f"{source.name} does not say which environment it is for")
+        found = find_source(run_or_name, allow_pickle) if actor == "policy" else environment_of(run_or_name)
+        source = found.within(env)
+        assert source.env_id is not None
         variations = parse_variations(variation) if variation else default_variations(source.env_id)[-1:]
         if len(variations) != 1:
             raise ValueError(f"--set gives {len(variations)} variations; one episode has one")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sb3_progpolicy.cli.parsing import ALLOW_PICKLE, check_folder, default_variations, parse_variations
-from sb3_progpolicy.cli.streams import quiet_stdout
+from sb3_progpolicy.cli.streams import plain_console, quiet_stdout
 from sb3_progpolicy.experiment.sources import find_program
 
 if TYPE_CHECKING:
@@ -151,10 +151,9 @@ def _compared(original: Program, small: Program, env_id: str, episodes: int, see
 
 
 def _print_summary(found: Simplification, rows: list[dict[str, object]], env_id: str) -> None:
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    console = plain_console()
     bound = found.terms_lower_bound
     words = (
         "no program of this form has fewer"

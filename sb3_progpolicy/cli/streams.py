@@ -6,6 +6,10 @@ import contextlib
 import os
 import sys
 from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 @contextlib.contextmanager
@@ -21,3 +25,13 @@ def quiet_stdout() -> Iterator[None]:
         finally:
             os.dup2(kept, 1)
             os.close(kept)
+
+
+def plain_console(**options: Any) -> Console:
+    """Return a console that shows texts as they are: no name of a run or a file is read as markup.
+
+    :param options: of rich's ``Console``
+    """
+    from rich.console import Console
+
+    return Console(markup=False, emoji=False, **options)

@@ -13,6 +13,7 @@ import typer
 from rich.console import Console
 
 from sb3_progpolicy.cli.parsing import ALLOW_PICKLE, parse_pairs
+from sb3_progpolicy.cli.streams import plain_console
 from sb3_progpolicy.hyperparams import algorithms
 
 # Flags that decide the outcome, which a resumed run takes from its folder.
@@ -76,7 +77,7 @@ def train(
     from sb3_progpolicy.experiment import run
 
     torch.set_num_threads(num_threads)
-    console = Console(stderr=True)
+    console = plain_console(stderr=True)
     with run.terminable(), contextlib.ExitStack() as stack:
         if resume is not None:
             _refuse_decided(context)

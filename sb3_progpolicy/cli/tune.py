@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from sb3_progpolicy.cli.streams import plain_console
 from sb3_progpolicy.hyperparams import algorithms
 
 if TYPE_CHECKING:
@@ -42,13 +43,12 @@ def tune(
     except ModuleNotFoundError:
         raise ValueError('optuna is missing: pip install "sb3-progpolicy[tune]"') from None
     import torch
-    from rich.console import Console
 
     from sb3_progpolicy.experiment import tuning as tunings
 
     torch.set_num_threads(num_threads)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    console = Console(stderr=True)
+    console = plain_console(stderr=True)
     tuning = tunings.Tuning(algo, env, n_trials, n_startup_trials, n_timesteps, max_seconds, episodes, seed)
     study = tunings.open_study(tuning, storage, study_name)
     done = len(tunings.finished(study))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sb3_progpolicy.cli.parsing import ALLOW_PICKLE, check_folder, parse_variations
-from sb3_progpolicy.cli.streams import quiet_stdout
+from sb3_progpolicy.cli.streams import plain_console, quiet_stdout
 from sb3_progpolicy.experiment.sources import Source, find_program
 
 if TYPE_CHECKING:
@@ -93,13 +93,12 @@ def _verified(
     seed: int,
     state: Path | None,
 ) -> list[Verification]:
-    from rich.console import Console
     from rich.progress import Progress
 
     from sb3_progpolicy.analysis import verify as verifying
 
     chosen = parse_variations(pairs) if pairs else None
-    with Progress(console=Console(stderr=True), transient=True) as bar:
+    with Progress(console=plain_console(stderr=True), transient=True) as bar:
         task = bar.add_task("starts", total=None)
 
         def progress(done: int, total: int) -> None:
@@ -119,7 +118,6 @@ def _verified(
 
 
 def _print_table(env_id: str, rows: list[Verification]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     exhaustive = all(row.exhaustive for row in rows)
@@ -137,7 +135,7 @@ def _print_table(env_id: str, rows: list[Verification]) -> None:
             "-" if row.worst_ratio is None else f"{row.worst_ratio:.2f}",
             "-" if row.success_bound is None else f"{row.success_bound:.2%}",
         )
-    console = Console()
+    console = plain_console()
     console.print(table)
     for row in rows:
         if row.counterexample is not None:

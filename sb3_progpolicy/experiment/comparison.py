@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sb3_progpolicy.env_ids import same_env
 from sb3_progpolicy.evaluation import Evaluation
 from sb3_progpolicy.experiment.folder import EVALUATIONS
 from sb3_progpolicy.experiment.sources import Source, evaluate_source
@@ -38,8 +39,7 @@ def compare_sources(
     :param seed: of the environments
     :raises ValueError: if the environments differ
     """
-    envs = list(dict.fromkeys(source.env_id for source in sources))
-    if len(envs) > 1:
+    if not all(same_env(source.env_id, sources[0].env_id) for source in sources):
         listed = ", ".join(f"{source.name}: {source.env_id}" for source in sources)
         raise ValueError(f"runs of different environments cannot be compared: {listed}")
     return [
@@ -81,7 +81,8 @@ def draw_comparison(compared: Sequence[Compared]) -> Any:
     planned = [row.optimal_steps_mean for row in compared[0].rows]
     if all(steps is not None for steps in planned):
         axes[0].plot(labels, planned, color="black", linestyle=":", label="planner")
-    axes[0].set_xlabel(", ".join(compared[0].rows[0].variation) or "variation")
+    names = dict.fromkeys(name for row in compared[0].rows for name in row.variation)
+    axes[0].set_xlabel(", ".join(names) or "variation")
     axes[0].set_ylabel("steps to the goal" if has_goal else "return")
     if has_goal:
         axes[0].set_yscale("log")

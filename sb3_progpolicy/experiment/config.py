@@ -9,11 +9,10 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, get_args
 
 import torch as th
-from gymnasium.envs.registration import load_env_creator
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_progpolicy.bounds import BOUNDS, MAX_ROLLOUT, limits_of
-from sb3_progpolicy.env_ids import spec_of
+from sb3_progpolicy.env_ids import creator_of
 from sb3_progpolicy.experiment.methods import METHODS, get_method
 from sb3_progpolicy.hyperparams import load_hyperparams, parse_kwargs, parse_number, shortened
 from sb3_progpolicy.nearest import unknown
@@ -174,9 +173,7 @@ def check_surroundings(config: RunConfig) -> None:
 
 
 def _check_env_kwargs(env_id: str, env_kwargs: Mapping[str, Any]) -> None:
-    entry_point = spec_of(env_id).entry_point
-    creator = entry_point if callable(entry_point) else load_env_creator(str(entry_point))
-    constructor = inspect.signature(creator).parameters
+    constructor = inspect.signature(creator_of(env_id)).parameters
     if any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in constructor.values()):
         return
     for name in env_kwargs:

@@ -49,8 +49,9 @@ def record(
         raise ValueError(f"-o {str(output)!r} is not accepted; the file is a .gif or an .mp4")
     if actor not in ACTORS:
         raise unknown("actor", actor, ACTORS)
-    if source.env_id is None:
-        raise ValueError(f"{source.name} does not say which environment it is for")
+    source = source.within()
+    assert source.env_id is not None
+    _check_renders(source.env_id)
     cap = max_steps or source.env_kwargs.get("max_episode_steps") or spec_of(source.env_id).max_episode_steps
     if cap is None:
         raise ValueError(f"{source.env_id} has no cap on steps; give --max-steps")
@@ -72,6 +73,29 @@ def record(
     finally:
         env.close()
     return steps, success
+
+
+def _check_renders(env_id: str) -> None:
+    """Raise ``ValueError`` if an environment has no pictures."""
+    from sb3_progpolicy.env_ids import creator_of
+
+    metadata = getattr(creator_of(env_id), "metadata", None)
+    if metadata is not None and "rgb_array" not in metadata.get("render_modes", ()):
+        modes = ", ".join(map(str, metadata.get("render_modes", ()))) or "none"
+        raise ValueError(f"{env_id} cannot be filmed; a film needs the render mode rgb_array, and it has {modes}")
+
+
+def _picture(env: Any) -> Any:
+    """Return what an environment shows, ``(height, width, 3)`` bytes."""
+    import numpy as np
+
+    frame = env.render()
+    if not isinstance(frame, np.ndarray) or frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
+        what = f"{frame.dtype} {frame.shape}" if isinstance(frame, np.ndarray) else type(frame).__name__
+        raise ValueError(
+            f"{env.spec.id} cannot be filmed; its render() returned {what} where (height, width, 3) bytes are expected"
+        )
+    return frame
 
 
 def environment_of(name: str) -> Source:
@@ -131,7 +155,7 @@ def _play(
     from rich.progress import Progress
 
     reward, done, info, steps = 0.0, False, dict[str, Any](), 0
-    show(env.render())
+    show(_picture(env))
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("playing", total=optimal or cap)
@@ -142,7 +166,7 @@ def _play(
             observation, reward, terminated, truncated, info = env.step(action)
             done = terminated or truncated
             steps += 1
-            show(env.render())
+            show(_picture(env))
             progress.advance(task)
     return steps, bool(info["is_success"]) if "is_success" in info else None
 

@@ -7,10 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_progpolicy.env_ids import env_to_act_in, id_from_file, same_env
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.pretrained import load_pretrained, pretrained_names
 from sb3_progpolicy.programs.interpreter import Semantics
 from sb3_progpolicy.programs.program import Program, load_program
+from sb3_progpolicy.surroundings import own_env_kwargs
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -23,10 +25,11 @@ class Source:
     """What a name on the command line stands for.
 
     :param name: as given
-    :param env_id: environment it was trained in, if known
+    :param env_id: environment it was trained in, if known and no module has to be imported for it
     :param program: if it is one
     :param model: if it is not a program
     :param env_kwargs: constructor arguments that it was trained with
+    :param named_env: environment that it names, whichever module registers it
     """
 
     name: str
@@ -34,6 +37,17 @@ class Source:
     program: Program | None
     model: BaseAlgorithm | None
     env_kwargs: dict[str, Any]
+    named_env: str | None = None
+
+    def within(self, env: str | None = None) -> Source:
+        """Return it with the environment that it is to act in, and the constructor arguments that are for this one.
+
+        :param env: in place of the environment that it was trained in; its module is imported where it is needed
+        :raises ValueError: if no environment is known
+        """
+        named = self.named_env or self.env_id
+        env_id = env_to_act_in(env or self.env_id, named, self.name, "--env ")
+        return replace(self, env_id=env_id, env_kwargs=self.env_kwargs if same_env(env_id, named) else {})
 
 
 def find_program(name: str, env: str | None = None, allow_pickle: bool = False) -> tuple[Program, str]:
@@ -47,10 +61,8 @@ def find_program(name: str, env: str | None = None, allow_pickle: bool = False) 
     source = find_source(name, allow_pickle)
     if source.program is None:
         raise ValueError(f"{name} is not a program; ProgPolicy and PRLPolicy learn programs")
-    env_id = env or source.env_id
-    if env_id is None:
-        raise ValueError(f"{name} does not say which environment it is for; give --env")
-    program = source.program
+    program, env_id = source.program, source.within(env).env_id
+    assert env_id is not None
     if source.env_kwargs:
         program = replace(program, metadata={**program.metadata, "env_kwargs": source.env_kwargs})
     return program, env_id
@@ -67,8 +79,6 @@ def find_source(name: str, allow_pickle: bool = False) -> Source:
     if path.is_dir():
         return _from_run(path, allow_pickle)
     if path.is_file() and path.suffix == ".json":
-        from sb3_progpolicy.env_ids import id_from_file
-
         source = _from_program(name, load_program(path))
         return replace(source, env_id=id_from_file(source.env_id))
     if path.is_file() and path.suffix == ".zip":
@@ -101,18 +111,16 @@ def evaluate_source(
     """
     from sb3_progpolicy.evaluation import evaluate_model, evaluate_program
 
-    env_id = env_id or source.env_id
-    if env_id is None:
-        raise ValueError(f"{source.name} does not say which environment it is for; give --env")
-    own = source.env_kwargs if env_id == source.env_id else {}  # those of another environment are not for this one
-    common: dict[str, Any] = {"env_kwargs": own, **arguments}
+    source = source.within(env_id)
+    assert source.env_id is not None
+    common: dict[str, Any] = {"env_kwargs": source.env_kwargs, **arguments}
     if source.program is None:
         assert source.model is not None
-        return evaluate_model(source.model, env_id, variations, n_episodes, **common)
+        return evaluate_model(source.model, source.env_id, variations, n_episodes, **common)
     return [
         row
         for kind in semantics
-        for row in evaluate_program(source.program, env_id, variations, n_episodes, kind, **common)
+        for row in evaluate_program(source.program, source.env_id, variations, n_episodes, kind, **common)
     ]
 
 
@@ -120,7 +128,7 @@ def _from_program(name: str, program: Program, env_kwargs: dict[str, Any] | None
     env_id = program.metadata.get("env")
     if env_id is not None and not isinstance(env_id, str):
         raise ValueError(f"{name}: metadata: env={env_id!r} is not accepted; it is an environment id")
-    return Source(name, env_id, program, None, dict(program.metadata.get("env_kwargs", {}) | (env_kwargs or {})))
+    return Source(name, env_id, program, None, {**own_env_kwargs(program), **(env_kwargs or {})}, env_id)
 
 
 def _from_run(folder: Path, allow_pickle: bool) -> Source:
@@ -148,10 +156,9 @@ def _from_model(path: Path, allow_pickle: bool) -> Source:
         raise
     except Exception as error:  # unpickling a damaged file may raise anything
         raise ValueError(f"{path} is not a model that can be loaded: {error}") from None
-    from sb3_progpolicy.env_ids import id_from_file
-
     env_kwargs = dict(config.env_kwargs if config else getattr(model, "env_kwargs", {}))
-    env_id = config.env if config else id_from_file(getattr(model, "env_id", None))
+    named = config.env if config else getattr(model, "env_id", None)
+    env_id = named if config else id_from_file(named)
     if holds_program(model):
-        return _from_program(str(path), extract_program(model, env=env_id), env_kwargs)
-    return Source(str(path), env_id, None, model, env_kwargs)
+        return replace(_from_program(str(path), extract_program(model, env=named), env_kwargs), env_id=env_id)
+    return Source(str(path), env_id, None, model, env_kwargs, named)
