@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import partial
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import (
@@ -27,12 +30,33 @@ from sb3_progpolicy.differentiable.module import ProgramModule
 from sb3_progpolicy.differentiable.tied import TiedLinear
 from sb3_progpolicy.distributions import BranchMixture, NormalizedCategorical
 from sb3_progpolicy.normalization import NormalizingExtractor
+from sb3_progpolicy.policy_arguments import check_policy_kwargs
 from sb3_progpolicy.programs.program import Program
 from sb3_progpolicy.programs.syntax import BoxSemantics, Cell
-from sb3_progpolicy.spaces import ActionSpec, action_spec, check_observation_space
+from sb3_progpolicy.programs.validation import check_size
+from sb3_progpolicy.spaces import ActionSpec, action_spec, check_observation_space, ends_with_history
 
-# W is one number per layer and has few updates to decide in, so that it takes larger steps than the controllers.
+# W is one number per layer and has few updates to decide in, so that it takes larger steps than the controllers. So it
+# is in ReptilePPO; in stock algorithms SB3 gives all parameters the same rate at every update.
 DERIVATION_LR_SCALE = 10.0
+_FOR_REPTILE_PPO: ContextVar[bool] = ContextVar("for_reptile_ppo", default=False)
+
+
+@contextmanager
+def for_reptile_ppo() -> Iterator[None]:
+    """Let policies be made that stock algorithms cannot train.
+
+    ReptilePPO adds the first action of a Discrete space to what a policy chooses, and updates the statistics of
+    :class:`NormalizingExtractor`; stock algorithms do neither.
+    """
+    token = _FOR_REPTILE_PPO.set(True)
+    try:
+        yield
+    finally:
+        _FOR_REPTILE_PPO.reset(token)
+
+
+SelfPolicy = TypeVar("SelfPolicy", bound="ProgrammaticActorCritic")
 
 
 class ProgrammaticActorCritic(ActorCriticPolicy):
@@ -56,16 +80,18 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
     :param persistence_init: what each action's score reads of having been taken before, at the start (for Box actions,
         what each output reads of its previous value): exploration that keeps its way for some steps, as in Dabney et
         al. (2021), but by the policy itself, so that PPO's ratios hold and training can undo it. The last inputs have
-        to be the interaction history
+        to be the interaction history, as in ReptilePPO and behind :class:`VecInteractionHistory`
     :param net_arch: hidden layers of the critic, a list or ``dict(vf=[...])``
     :param activation_fn: of the critic
     :param log_std_init: initial logarithm of the standard deviation of Box actions
     :param optimizer_class: of the inner updates
     :param optimizer_kwargs: of the optimizer; for Adam ``eps=1e-5`` and the fused kernel by default
     :param reset_state_at_episode_start: zero the conditions' states when an episode starts; by default they survive
-        it, and only the caller's ``state=None`` (or a task switch in ``ReptilePPO``) zeroes them (section 2.4)
-    :param kwargs: further arguments of SB3's ``ActorCriticPolicy``
-    :raises ValueError: if a space or a value is not accepted
+        it, and only the caller's ``state=None`` (or a task switch in ``ReptilePPO``) zeroes them (section 2.4). With
+        ``True``, which ``ReptilePPO`` does not take, no program is extracted, for it does not forget
+    :param kwargs: further arguments of SB3's ``ActorCriticPolicy``; ``features_extractor_class=NormalizingExtractor``
+        is for ReptilePPO alone, as are Discrete actions that do not start at 0
+    :raises ValueError: if a space or a value is not accepted, or the program would be too large to print
     """
 
     def __init__(
@@ -90,10 +116,9 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
         **kwargs: Any,
     ) -> None:
         check_observation_space(observation_space)
+        check_policy_kwargs(locals())
         if temperature <= 0:
             raise ValueError(f"temperature={temperature} is not accepted; it is above 0")
-        if n_conditions is not None and n_conditions < 0:
-            raise ValueError(f"n_conditions={n_conditions} is not accepted; it is at least 0")
         if not math.isfinite(persistence_init):
             raise ValueError(f"persistence_init={persistence_init} is not accepted; it is a finite number")
         extractor = kwargs.get("features_extractor_class", FlattenExtractor)
@@ -123,6 +148,14 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
         if n_conditions is not None:
             self.program_kwargs["depth"] = n_conditions + 1
         self.spec_of_actions: ActionSpec = action_spec(action_space)
+        n_inputs = int(np.prod(observation_space.shape or ()))
+        check_size(n_inputs, self.spec_of_actions, self.program_kwargs["depth"] - 1, cell, condition_size)
+        self._check_algorithm(action_space, extractor)
+        if persistence_init and not ends_with_history(observation_space, self.spec_of_actions):
+            raise ValueError(
+                f"persistence_init={persistence_init} is not accepted; the last inputs are not the previous action, "
+                "reward and done flag. VecInteractionHistory around the environment appends them"
+            )
         self.reset_state_at_episode_start = reset_state_at_episode_start
         if optimizer_kwargs is None and optimizer_class is th.optim.Adam:
             # SB3's epsilon for PPO, and one kernel for all parameters.
@@ -140,6 +173,28 @@ class ProgrammaticActorCritic(ActorCriticPolicy):
             optimizer_kwargs=optimizer_kwargs,
             **kwargs,
         )
+
+    @staticmethod
+    def _check_algorithm(action_space: spaces.Space[Any], extractor: type[nn.Module]) -> None:
+        """Raise ``ValueError`` for what a stock algorithm would do wrong without a word."""
+        if _FOR_REPTILE_PPO.get():
+            return
+        if isinstance(action_space, spaces.Discrete) and action_space.start != 0:
+            raise ValueError(
+                f"action space {action_space} is not accepted; Stable-Baselines3's algorithms give the environment "
+                f"actions from 0 on, where the program acts from {action_space.start} on. ReptilePPO takes such spaces"
+            )
+        if extractor is NormalizingExtractor:
+            raise ValueError(
+                "features_extractor_class=NormalizingExtractor is not accepted here; only ReptilePPO updates its "
+                "statistics. Put VecNormalize around the environment, which is folded into the program, too"
+            )
+
+    @classmethod
+    def load(cls: type[SelfPolicy], path: str, device: th.device | str = "auto") -> SelfPolicy:
+        """Load a policy that was saved alone, by whichever algorithm. See SB3's ``BaseModel.load``."""
+        with for_reptile_ppo():
+            return super().load(path, device)
 
     def _build(self, lr_schedule: Schedule) -> None:
         """Build the program, the critic and the optimizer."""

@@ -146,7 +146,8 @@ def evaluate_model(
         assert model.observation_space is not None
         if model.action_space is not None and not _alike(model.action_space, venv.action_space):
             raise ValueError(f"the model acts in {model.action_space}; {env_id} has {venv.action_space}")
-        if normalizer is not None:
+        outside = normalizer is not None and normalizer.observation_space.shape != venv.observation_space.shape
+        if normalizer is not None and not outside:
             venv = _normalized(venv, normalizer)
         if venv.observation_space.shape == model.observation_space.shape:
             return venv
@@ -156,7 +157,8 @@ def evaluate_model(
                 f"the model reads observations {model.observation_space.shape}; {env_id} has "
                 f"{venv.observation_space.shape}, or {joined.shape} with the interaction history"
             )
-        return VecInteractionHistory(venv)
+        venv = VecInteractionHistory(venv)
+        return _normalized(venv, normalizer) if normalizer is not None and outside else venv
 
     def start(venv: VecEnv) -> Act:
         state: Any = None

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import (
     VecVideoRecorder,
 )
 
-from sb3_progpolicy.interaction import VecInteractionHistory, appends_history, program_names
+from sb3_progpolicy.interaction import VecInteractionHistory, appends_history, program_names, reads_scaled_rewards
 from sb3_progpolicy.policies import ProgrammaticActorCritic
 from sb3_progpolicy.programs.program import LEARNED_BY, Program
 from sb3_progpolicy.programs.transform import fold_normalization
@@ -29,8 +29,15 @@ _HARMLESS |= {"OrderEnforcing", "PassiveEnvChecker", "InteractionHistory", "Rema
 
 
 def holds_program(model: BaseAlgorithm) -> bool:
-    """Return whether a model's policy is a program (``ProgPolicy`` or ``PRLPolicy``)."""
-    return isinstance(model.policy, ProgrammaticActorCritic)
+    """Return whether a model's policy is a program (``ProgPolicy`` or ``PRLPolicy``) that can be taken out of it.
+
+    It cannot where the policy resets the conditions' states when an episode starts, which a program does not do.
+    """
+    return isinstance(model.policy, ProgrammaticActorCritic) and not _resets_states(model.policy)
+
+
+def _resets_states(policy: ProgrammaticActorCritic) -> bool:
+    return policy.reset_state_at_episode_start and policy.module.conditions.recurrent
 
 
 def extract_program(model: BaseAlgorithm, **metadata: Any) -> Program:
@@ -46,11 +53,18 @@ def extract_program(model: BaseAlgorithm, **metadata: Any) -> Program:
     :param metadata: JSON values to keep with it; environment id, seed, number of steps and way of
         learning are put in
     :raises TypeError: if the policy is not a program
-    :raises ValueError: if the policy reads rewards that ``VecNormalize`` has scaled
+    :raises ValueError: if the policy reads rewards that ``VecNormalize`` has scaled, or resets its conditions' states
+        when an episode starts
     """
     policy, env = model.policy, model.get_env()
     if not isinstance(policy, ProgrammaticActorCritic):
         raise TypeError(f"{type(policy).__name__} is not a program; ProgPolicy and PRLPolicy are")
+    if _resets_states(policy):
+        raise ValueError(
+            "a policy with reset_state_at_episode_start=True cannot be extracted; a program is not told that an "
+            "episode starts, and would remember what the policy forgets. Train with False, or without conditions that "
+            "remember (cell='affine')"
+        )
     # ReptilePPO knows these without its environment too.
     inputs, outputs = getattr(model, "input_names", None), getattr(model, "output_names", None)
     env_id, interaction = getattr(model, "env_id", None), getattr(model, "interaction_history", False)
@@ -75,7 +89,15 @@ def extract_program(model: BaseAlgorithm, **metadata: Any) -> Program:
     # A saved model's tuples are loaded as lists.
     program = policy.program(tuple(inputs or ()), tuple(outputs or ()), interaction, **{**origin, **metadata})
     normalizer = model.get_vec_normalize_env()
-    return program if normalizer is None else _fold(program, normalizer)
+    if normalizer is None:
+        return program
+    if program.interaction and env is not None and reads_scaled_rewards(env):
+        raise ValueError(
+            "a program that reads its previous reward cannot be trained on rewards that VecNormalize scales: run alone "
+            "it would read others. Give VecNormalize norm_reward=False, or put it around VecInteractionHistory, which "
+            "then reads rewards as they are; ReptilePPO has scale_rewards=True"
+        )
+    return _fold(program, normalizer)
 
 
 def _plain(values: Any) -> Any:
@@ -87,11 +109,6 @@ def _plain(values: Any) -> Any:
 
 
 def _fold(program: Program, normalizer: VecNormalize) -> Program:
-    if program.interaction and normalizer.norm_reward:
-        raise ValueError(
-            "a program that reads its previous reward cannot be trained on rewards that VecNormalize scales: run alone "
-            "it would read others. Give VecNormalize norm_reward=False; ReptilePPO has scale_rewards=True"
-        )
     mean, scale = np.zeros(program.n_inputs), np.ones(program.n_inputs)
     if normalizer.norm_obs:
         statistics: Any = normalizer.obs_rms

@@ -7,7 +7,13 @@ from typing import Any, cast
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, is_vecenv_wrapped
+from stable_baselines3.common.vec_env import (
+    VecEnv,
+    VecEnvWrapper,
+    VecNormalize,
+    is_vecenv_wrapped,
+    unwrap_vec_wrapper,
+)
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from typing_extensions import deprecated
 
@@ -109,6 +115,19 @@ class VecInteractionHistory(VecEnvWrapper):
 def appends_history(venv: VecEnv) -> bool:
     """Return whether observations end with the interaction history, whichever wrapper appends it."""
     return is_vecenv_wrapped(venv, VecInteractionHistory) or any(venv.env_is_wrapped(InteractionHistory))
+
+
+def reads_scaled_rewards(venv: VecEnv) -> bool:
+    """Return whether the interaction history shows rewards that ``VecNormalize``, beneath what appends it, scales.
+
+    :param venv: environments with the history
+    """
+    while isinstance(venv, VecEnvWrapper):
+        if isinstance(venv, VecInteractionHistory):
+            normalizer = unwrap_vec_wrapper(venv.venv, VecNormalize)
+            return normalizer is not None and normalizer.norm_reward
+        venv = venv.venv
+    return False
 
 
 def program_names(venv: VecEnv) -> Names:

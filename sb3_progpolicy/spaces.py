@@ -89,16 +89,37 @@ def interaction_space(observation_space: spaces.Space[Any], spec: ActionSpec) ->
     :raises ValueError: for any other observation space
     """
     observation_space = check_observation_space(observation_space)
+    low, high = _history_bounds(spec)
+    return spaces.Box(
+        np.concatenate((observation_space.low, low)).astype(np.float32),
+        np.concatenate((observation_space.high, high)).astype(np.float32),
+        dtype=np.float32,
+    )
+
+
+def ends_with_history(space: spaces.Space[Any], spec: ActionSpec) -> bool:
+    """Return whether the last numbers of an observation space have the bounds of the interaction history.
+
+    :param space: any
+    :param spec: the action space
+    """
+    size = spec.interaction_size
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1 or space.shape[0] < size:
+        return False
+    low, high = _history_bounds(spec)
+    return np.array_equal(space.low[-size:], low) and np.array_equal(space.high[-size:], high)
+
+
+def _history_bounds(spec: ActionSpec) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     if spec.kind == "box":
         low, high = (np.asarray(bound, dtype=np.float32) for bound in (spec.low, spec.high))
     else:
         low, high = np.zeros(spec.history_size, np.float32), np.ones(spec.history_size, np.float32)
     unbounded = np.finfo(np.float32).max
     # Before the first action all its numbers are zero, whatever the bounds.
-    return spaces.Box(
-        np.concatenate((observation_space.low, np.minimum(low, 0), [-unbounded, 0])).astype(np.float32),
-        np.concatenate((observation_space.high, np.maximum(high, 0), [unbounded, 1])).astype(np.float32),
-        dtype=np.float32,
+    return (
+        np.concatenate((np.minimum(low, 0), [-unbounded, 0])).astype(np.float32),
+        np.concatenate((np.maximum(high, 0), [unbounded, 1])).astype(np.float32),
     )
 
 
@@ -117,12 +138,18 @@ def encode_actions(actions: NDArray[Any], spec: ActionSpec) -> NDArray[np.float3
     :param actions: ``(n_envs, *action_shape)``, each in the action space
     :param spec: the action space
     :return: ``(n_envs, spec.history_size)``
+    :raises ValueError: if an action of a space that does not start at 0 is not in it
     """
     n_envs = len(actions)
     if spec.kind in ("box", "multi_binary"):
         return actions.reshape(n_envs, -1).astype(np.float32)
     encoded = np.zeros((n_envs, spec.history_size), dtype=np.float32)
     columns = actions.reshape(n_envs, -1) - spec.start
+    if spec.start and not ((columns >= 0) & (columns < spec.sizes[0])).all():
+        raise ValueError(
+            f"actions {actions.ravel().tolist()} are not accepted; they are from {spec.start} to "
+            f"{spec.start + spec.sizes[0] - 1}, and Stable-Baselines3's algorithms choose from 0 on"
+        )
     if len(spec.sizes) > 1:
         columns = columns + np.concatenate(([0], np.cumsum(spec.sizes)[:-1]))
     encoded[np.arange(n_envs)[:, None], columns] = 1

@@ -175,7 +175,7 @@ def test_program_of_a_policy_reads_what_the_policy_reads():
         (ProgrammaticPolicy, {"cell": "gru"}, "RecurrentProgrammaticPolicy"),
         (ProgrammaticPolicy, {"depth": 0}, "depth=0"),
         (ProgrammaticPolicy, {"temperature": 0.0}, "temperature=0.0"),
-        (RecurrentProgrammaticPolicy, {"condition_size": 0}, "condition size 0"),
+        (RecurrentProgrammaticPolicy, {"condition_size": 0}, "condition_size=0"),
         (RecurrentProgrammaticPolicy, {"use_sde": True}, "use_sde=True"),
     ],
 )

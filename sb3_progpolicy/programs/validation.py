@@ -6,7 +6,16 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
-from sb3_progpolicy.programs.syntax import BOX_SEMANTICS, GATES, Condition, Controller, IfThenElse, ProgramData
+from sb3_progpolicy.programs.syntax import (
+    BOX_SEMANTICS,
+    GATES,
+    STATELESS,
+    Cell,
+    Condition,
+    Controller,
+    IfThenElse,
+    ProgramData,
+)
 from sb3_progpolicy.spaces import ActionKind, ActionSpec
 
 # Far above real use (a screen of Atari is 7 056 inputs), and small enough that every printer takes seconds.
@@ -48,6 +57,30 @@ def check_program(program: ProgramData) -> None:
     if not isinstance(program.metadata, Mapping):
         raise ValueError(f"metadata: {type(program.metadata).__name__} given; a mapping is accepted")
     _check_json("metadata", dict(program.metadata), MAX_METADATA_DEPTH)
+
+
+def check_size(n_inputs: int, action: ActionSpec, n_conditions: int, cell: Cell, condition_size: int) -> None:
+    """Check that a program is not too large to be printed and saved, before it is learnt.
+
+    :param n_inputs: length of X
+    :param action: the action space
+    :param n_conditions: of the longest program
+    :param cell: of its conditions
+    :param condition_size: their hidden units, or the sums of a ``"min"``
+    :raises ValueError: naming the limit and what may be lowered
+    """
+    hidden = 0 if cell in STATELESS else condition_size
+    n_rows = condition_size if cell == "min" else hidden * len(GATES[cell])
+    of_condition = n_rows * (n_inputs + hidden + 2) + (n_inputs if cell == "affine" else hidden) + 1
+    n_numbers = (n_conditions + 1) * action.n_outputs * (n_inputs + 1) + n_conditions * of_condition
+    for what, given, most, advice in (
+        ("inputs", n_inputs, MAX_INPUTS, "give shorter observations"),
+        ("outputs", action.n_outputs, MAX_OUTPUTS, "give fewer actions"),
+        ("conditions", n_conditions, MAX_CONDITIONS, "give a smaller depth, or n_conditions"),
+        ("weights and constants", n_numbers, MAX_NUMBERS, "give a smaller depth, condition_size or observation"),
+    ):
+        if given > most:
+            raise ValueError(f"a program of {given} {what} is not accepted; it has at most {most}: {advice}")
 
 
 def _check_action(action: ActionSpec) -> None:

@@ -9,11 +9,11 @@ from typing import Any
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, is_vecenv_wrapped, unwrap_vec_wrapper
+from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
 
 from progpolicy_envs import find_domain
 from progpolicy_envs.symmetry import Symmetry
-from sb3_progpolicy.interaction import InteractionHistory, VecInteractionHistory
+from sb3_progpolicy.interaction import InteractionHistory, VecInteractionHistory, reads_scaled_rewards
 from sb3_progpolicy.reptile.tasks import RemakeOnVariation
 from sb3_progpolicy.symmetries import as_data
 from sb3_progpolicy.vec_env import make_fast_vec_env
@@ -65,23 +65,24 @@ def with_history(venv: VecEnv, interaction_history: bool, learns_program: bool =
     :param venv: environments
     :param interaction_history: whether the policy reads it
     :param learns_program: whether the policy is a program, which is run where nothing scales rewards
-    :raises ValueError: if a single environment is wrapped in :class:`InteractionHistory`, or rewards are scaled
+    :raises ValueError: if a single environment is wrapped in :class:`InteractionHistory`, or it would show
+        rewards that are scaled
     """
     if interaction_history and any(venv.env_is_wrapped(InteractionHistory)):
         raise ValueError(
             "an environment wrapped in InteractionHistory is not accepted; ReptilePPO appends the history itself. "
             "Give it the environment without the wrapper, or interaction_history=False"
         )
-    normalizer = unwrap_vec_wrapper(venv, VecNormalize)
-    if interaction_history and learns_program and normalizer is not None and normalizer.norm_reward:
+    joined = venv
+    if interaction_history and not is_vecenv_wrapped(venv, VecInteractionHistory):
+        joined = VecInteractionHistory(venv)
+    if interaction_history and learns_program and reads_scaled_rewards(joined):
         raise ValueError(
             "VecNormalize with norm_reward=True is not accepted for a program that reads its previous reward: nothing "
-            "outside of training scales it. Give VecNormalize norm_reward=False; scale_rewards=True scales what is "
-            "learnt from"
+            "outside of training scales it. Give VecNormalize norm_reward=False, or put it around "
+            "VecInteractionHistory; scale_rewards=True scales what is learnt from"
         )
-    if interaction_history and not is_vecenv_wrapped(venv, VecInteractionHistory):
-        return VecInteractionHistory(venv)
-    return venv
+    return joined
 
 
 def symmetries_of(env_id: str | None, venv: VecEnv | None) -> list[dict[str, Any]]:

@@ -100,6 +100,11 @@ def complete_policy_kwargs(
             f"persistence_init={given['persistence_init']} is not accepted with interaction_history=False; the policy "
             "then does not see its previous action"
         )
+    if given.get("reset_state_at_episode_start"):
+        raise ValueError(
+            "reset_state_at_episode_start=True is not accepted; in ReptilePPO states survive the end of an episode and "
+            "are zeroed at a task switch only (section 2.4)"
+        )
     completed = dict(given)
     if normalize_observations:
         completed.setdefault("features_extractor_class", NormalizingExtractor)

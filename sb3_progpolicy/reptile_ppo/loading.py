@@ -19,6 +19,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces
 
 from sb3_progpolicy.bounds import MAX_ENVS, MAX_ROLLOUT
+from sb3_progpolicy.env_ids import same_env
 from sb3_progpolicy.reptile.samplers import SAMPLERS
 from sb3_progpolicy.reptile.steps import META_OPTIMIZERS
 from sb3_progpolicy.reptile.tasks import TaskDistribution
@@ -121,6 +122,7 @@ def _load_pickles(
         env = with_history(make_venv(env, n_envs, data["seed"], env_kwargs), data["interaction_history"])
     load = PPO.load.__func__  # type: ignore[attr-defined]
     model = load(cls, path, env, device, dict(custom_objects), False, force_reset, **changes)
+    model.policy.reset_state_at_episode_start = False  # had no effect
     model.env_kwargs = env_kwargs
     return model
 
@@ -161,11 +163,14 @@ def _make(
 ) -> ReptilePPO:
     """Make the model, in the environments given or without any."""
     arguments, state = {**saved.arguments, **changes}, saved.state
+    if (arguments.get("policy_kwargs") or {}).get("reset_state_at_episode_start") and "policy_kwargs" not in changes:
+        # Accepted once, without an effect: states were not reset.
+        arguments["policy_kwargs"] = {**arguments["policy_kwargs"], "reset_state_at_episode_start": False}
     if isinstance(arguments.get("tasks"), dict) and "tasks" not in changes:
         arguments["tasks"] = _tasks(arguments["tasks"])
     if isinstance(env, str):
         arguments.setdefault("n_envs", state["n_envs"])
-        if env.rpartition(":")[2] != (state.get("env_id") or "").rpartition(":")[2]:
+        if not same_env(env, state.get("env_id")):
             arguments["env_kwargs"] = changes.get("env_kwargs")  # those saved are another environment's
     elif env is not None:
         for name in {"env_kwargs", "max_episode_steps"} - set(changes):

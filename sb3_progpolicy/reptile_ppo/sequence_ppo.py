@@ -20,6 +20,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_progpolicy.actor_critic import for_reptile_ppo
 from sb3_progpolicy.finite import check_parameters, check_step, check_update
 from sb3_progpolicy.nearest import unknown
 from sb3_progpolicy.normalization import NormalizingExtractor, RewardScaler
@@ -115,7 +116,8 @@ class SequencePPO(PPO):
                 "Wrap the environment in gymnasium.wrappers.FlattenObservation"
             )
         self.rollout_buffer_class = SequenceBuffer
-        super()._setup_model()
+        with for_reptile_ppo():
+            super()._setup_model()
         self.adapter = adapt(self.policy)
         if self.recurrent and self.sequence_length < min(self.n_steps, self.batch_size):
             warnings.warn(
