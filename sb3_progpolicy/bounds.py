@@ -30,6 +30,11 @@ BOUNDS: Mapping[str, tuple[float, float]] = {
     "n_steps": (1, MAX_ROLLOUT),
     "n_timesteps": (1, 2**53),
     "max_episode_steps": (1, 2**53),
+    # As SB3 has them: -1 for as many gradient steps as steps were made, or noise drawn once a rollout.
+    "gradient_steps": (-1, math.inf),
+    "sde_sample_freq": (-1, math.inf),
+    "learning_starts": (0, math.inf),
+    "high_learning_starts": (0, math.inf),
 }
 
 

@@ -197,6 +197,36 @@ def test_dead_worker_is_one_line_that_says_what_is_saved_and_how_to_go_on(tmp_pa
     assert f"saved at step {steps(folder)} in {folder}. To go on: progpolicy train --resume {folder}" in said
 
 
+@pytest.mark.parametrize("algo", ["reptile_ppo", "sac"])
+def test_training_that_diverges_keeps_what_was_finite(algo, tmp_path, monkeypatch, capsys):
+    def diverges(what, values, timesteps):
+        if timesteps >= 300:
+            raise FloatingPointError(f"the reward is not finite (NaN or infinite) at step {timesteps}")
+
+    place = "reptile_ppo.sequence_ppo" if algo == "reptile_ppo" else "baselines.discrete_sac.algorithm"
+    monkeypatch.setattr(f"sb3_progpolicy.{place}.check_step", diverges)
+    small = SMALL if algo == "reptile_ppo" else ["--algo", "sac", "--env", "Hanoi-v0", "--seed", "1"]
+    assert run(["train", "-f", str(tmp_path), "-n", "2000", *small]) == 2
+    folder = tmp_path / algo / "Hanoi-v0_1"
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert "the reward is not finite" in said
+    saved = timesteps_of(folder / "model.zip")
+    assert f"saved at step {saved} in {folder}. To train from there with other hyperparameters: progpolicy" in said
+    assert f"-i {folder}" in said
+    assert saved > 0
+
+
+def test_parameters_that_are_not_finite_are_not_saved(tmp_path, monkeypatch, capsys):
+    def diverges(self, total_timesteps, **_):
+        next(iter(self.policy.parameters())).data.fill_(float("nan"))
+        raise FloatingPointError("parameter w is not finite")
+
+    monkeypatch.setattr("sb3_progpolicy.baselines.discrete_sac.DiscreteSAC.learn", diverges)
+    assert run(["train", "-f", str(tmp_path), "--algo", "sac", "--env", "Hanoi-v0", "-n", "10"]) == 2
+    assert "the parameters are not saved" in capsys.readouterr().err
+    assert not (tmp_path / "sac" / "Hanoi-v0_1" / "model.zip").exists()
+
+
 def test_full_disk_is_one_line_that_names_the_file(tmp_path, monkeypatch, capsys):
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

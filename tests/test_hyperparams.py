@@ -1,6 +1,7 @@
 import json
 
 import pytest
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from sb3_progpolicy.experiment.config import _accepted, make_config, parse_config
 from sb3_progpolicy.experiment.methods import METHODS
@@ -51,6 +52,61 @@ def test_nothing_in_policy_kwargs_is_run(value):
 def test_number_with_an_exponent_is_a_number():
     assert parse_value("1e-3") == 1e-3
     assert make_config("reptile_ppo", "Hanoi-v0", 0, overrides={"n_timesteps": "4e5"}).n_timesteps == 400_000
+
+
+def test_numbers_within_lists_and_mappings_are_numbers():
+    kwargs = "{optimizer_kwargs: {eps: 1e-5, betas: [9E-1, 0.999]}, cell: gru}"
+    expected = {"optimizer_kwargs": {"eps": 1e-5, "betas": [0.9, 0.999]}, "cell": "gru"}
+    assert parse_value(kwargs) == parse_kwargs("policy_kwargs", parse_value(kwargs)) == expected
+    assert parse_kwargs("policy_kwargs", {"optimizer_kwargs": {"eps": "1e-5"}})["optimizer_kwargs"]["eps"] == 1e-5
+    overrides = {"sampler": {"name": "curriculum", "fraction": "5e-1"}, "tasks": {"n_discs": [1, 2]}}
+    assert make_config("reptile_ppo", "Hanoi-v0", 0, overrides=overrides).hyperparams["sampler"]["fraction"] == 0.5
+    assert parse_value("{name: e5, layout: '12', other: 1e5x}") == {"name": "e5", "layout": "12", "other": "1e5x"}
+    with pytest.raises(ValueError, match="numbers are finite"):
+        parse_value("{eps: 1e999}")
+    with pytest.raises(ValueError, match="numbers are finite"):
+        parse_kwargs("policy_kwargs", {"optimizer_kwargs": {"eps": "1e999"}})
+
+
+@pytest.mark.parametrize(
+    ("algo", "env_id", "overrides"),
+    [
+        ("sac", "Hanoi-v0", {"gradient_steps": -1, "learning_starts": 0}),
+        ("sac", "Pendulum-v1", {"train_freq": [1, "episode"], "n_envs": 1, "sde_sample_freq": -1}),
+        ("sac", "Pendulum-v1", {"train_freq": [4, "step"]}),
+        ("hiro", "Pendulum-v1", {"gradient_steps": -1, "high_learning_starts": 0}),
+        ("ppo", "Pendulum-v1", {"sde_sample_freq": -1, "use_sde": True}),
+    ],
+)
+def test_values_that_stable_baselines_accepts_are_accepted(algo, env_id, overrides):
+    config = make_config(algo, env_id, 0, overrides=overrides)
+    assert parse_config(json.loads(json.dumps(vars(config)))) == config
+    model, _ = build_model(config)
+    for name, value in overrides.items():
+        expected = TrainFreq(value[0], TrainFrequencyUnit(value[1])) if name == "train_freq" else value
+        assert getattr(model, name) == expected
+
+
+@pytest.mark.parametrize(
+    ("algo", "overrides", "said"),
+    [
+        ("sac", {"train_freq": [1, "day"]}, r"train_freq=\[1, 'day'\] is not accepted"),
+        (
+            "sac",
+            {"train_freq": [0, "step"]},
+            "a whole number of at least 1, or such a number and step or episode",
+        ),
+        ("sac", {"train_freq": [1, "episode"]}, "give n_envs=1"),
+        ("sac", {"gradient_steps": -2}, "gradient_steps=-2 is not accepted"),
+        ("reptile_ppo", {"policy_kwargs": {"activation_fn": "relu"}}, "activation_fn='relu' is not accepted"),
+        ("ppo", {"policy_kwargs": {"activation_fn": "relu"}}, "activation_fn='relu' is not accepted"),
+        ("reptile_ppo", {"policy_kwargs": {"depth": 2.5}}, "depth=2.5 is not accepted; it is a whole number"),
+        ("hiro", {"policy_kwargs": {"net_arch": 64}}, "net_arch=64 is not accepted; it is a list of layer sizes"),
+    ],
+)
+def test_values_that_are_not_accepted_are_named(algo, overrides, said):
+    with pytest.raises(ValueError, match=said):
+        make_config(algo, "Hanoi-v0", 0, overrides=overrides)
 
 
 def test_linear_schedule_falls_to_zero():

@@ -100,6 +100,8 @@ TRACEBACK, MAX_LINE = "PROGPOLICY_TRACEBACK", 1000
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit: 0, 2 for what is not accepted, 1 for an unexpected error, 130 when interrupted.
 
+    2 is also for training that has met a number that is not finite.
+
     :param arguments: without the program's name; ``sys.argv`` by default
     """
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
@@ -124,7 +126,7 @@ def run(arguments: Sequence[str]) -> int:
     except Exception as error:
         if os.environ.get(TRACEBACK, "0") != "0" or "--verbose 2" in " ".join(given).replace("=", " "):
             traceback.print_exc()
-        if isinstance(error, (ValueError, OSError, ModuleNotFoundError)):
+        if isinstance(error, (ValueError, OSError, ModuleNotFoundError, FloatingPointError)):
             _say(str(error))
             return USAGE_ERROR
         _say(f"unexpected {type(error).__name__}: {str(error)[:200]}; its report is in {_write_report(given)}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, get_args
 
@@ -14,8 +14,9 @@ from stable_baselines3.common.utils import LinearSchedule
 from sb3_progpolicy.bounds import BOUNDS, MAX_ROLLOUT, limits_of
 from sb3_progpolicy.env_ids import creator_of
 from sb3_progpolicy.experiment.methods import METHODS, get_method
-from sb3_progpolicy.hyperparams import load_hyperparams, parse_kwargs, parse_number, shortened
+from sb3_progpolicy.hyperparams import load_hyperparams, parse_kwargs, parse_number, parse_numbers, shortened
 from sb3_progpolicy.nearest import unknown
+from sb3_progpolicy.policy_arguments import check_policy_kwargs
 from sb3_progpolicy.reptile.callback import ReptileWrapper
 from sb3_progpolicy.reptile.samplers import make_sampler
 from sb3_progpolicy.reptile_ppo.environments import DEFAULT_N_ENVS
@@ -47,6 +48,8 @@ _ELSEWHERE = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_i
 _ELSEWHERE |= {f"{kind}_buffer_{part}" for kind in ("rollout", "replay") for part in ("class", "kwargs")} | {
     "action_noise"
 }
+# What SB3 counts between two updates.
+_UNITS = ("step", "episode")
 # Texts of which there are few.
 _CHOICES = {"timeouts": get_args(Timeouts)}
 # Texts that may be numbers, too.
@@ -151,6 +154,9 @@ def check_config(config: RunConfig) -> RunConfig:
     checked = {name: _checked(name, value, accepted[name]) for name, value in config.hyperparams.items()}
     if checked.get("n_envs", 1) * checked.get("n_steps", 1) > MAX_ROLLOUT:
         raise ValueError(f"n_envs times n_steps is more than {MAX_ROLLOUT} transitions, which is not accepted")
+    by_episode = isinstance(checked.get("train_freq"), list) and checked["train_freq"][1] == "episode"
+    if by_episode and checked.get("n_envs", DEFAULT_N_ENVS) != 1:
+        raise ValueError(f"train_freq={checked['train_freq']} is not accepted with several environments; give n_envs=1")
     config = replace(config, hyperparams=checked)
     _check_policy(config)
     return config
@@ -197,7 +203,7 @@ def _accepted(algo: str) -> dict[str, Any]:
 
 def _checked(name: str, value: Any, default: Any) -> Any:
     """Return a value as the type of its default, so that a slip is an error here and not deep inside torch."""
-    value = parse_number(value)
+    value = parse_numbers(parse_number(value))
     if name == "policy_kwargs":
         return parse_kwargs(name, value)
     if name == "init_program" and value is not None and not isinstance(value, str):
@@ -216,6 +222,8 @@ def _checked(name: str, value: Any, default: Any) -> Any:
         if not isinstance(value, bool):
             raise ValueError(f"{name}={shortened(value)} is not accepted; it is true or false")
         return value
+    if name == "train_freq" and isinstance(value, (list, tuple)):
+        return _frequency(name, value)
     if isinstance(default, int) or name in ("batch_size", "n_envs", "max_episode_steps"):
         number = _number(name, value, "a whole number", (1, math.inf))
         if number != int(number):
@@ -230,6 +238,17 @@ def _checked(name: str, value: Any, default: Any) -> Any:
     if name in _CHOICES and value not in _CHOICES[name]:
         raise unknown(name, value, _CHOICES[name])
     return value
+
+
+def _frequency(name: str, value: Sequence[Any]) -> list[Any]:
+    """Return SB3's pair of a number and what is counted."""
+    number, unit = value if len(value) == 2 else (None, None)
+    if isinstance(number, bool) or not isinstance(number, int) or number < 1 or unit not in _UNITS:
+        raise ValueError(
+            f"{name}={shortened(value)} is not accepted; it is a whole number of at least 1, or such a number and "
+            f"{' or '.join(_UNITS)}, as in [1, episode]"
+        )
+    return [number, unit]
 
 
 def _number(name: str, value: Any, accepted: str, bounds: tuple[float, float] = (-math.inf, math.inf)) -> float:
@@ -273,3 +292,4 @@ def _check_policy(config: RunConfig) -> None:
     for name in config.hyperparams.get("policy_kwargs") or {}:
         if name not in known:
             raise unknown("policy_kwargs entry", name, sorted(known))
+    check_policy_kwargs(config.hyperparams.get("policy_kwargs") or {})

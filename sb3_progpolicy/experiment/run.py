@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shlex
 import signal
 import sys
 import threading
@@ -12,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
@@ -58,6 +60,8 @@ def build_model(
     }
     arguments |= {"seed": config.seed, "device": config.device, "verbose": verbose, "tensorboard_log": tensorboard_log}
     policy = arguments.pop("policy")
+    if isinstance(arguments.get("train_freq"), list):  # SB3 takes a pair as a tuple, which no file has
+        arguments["train_freq"] = tuple(arguments["train_freq"])
     try:
         if method.has_reptile:
             return method.algorithm(policy, config.env, env_kwargs=config.env_kwargs, **arguments), None  # type: ignore[call-arg]
@@ -143,6 +147,10 @@ class Interrupted(Exception):
         self.timesteps, self.resumable, self.reason = timesteps, resumable, reason
 
 
+class Diverged(FloatingPointError):
+    """Training has met a number that is not finite; its message says what of the parameters is saved, and where."""
+
+
 class _RunCheckpoint(ReptileCheckpoint):
     """Checkpoints of a run: the model and, if it is one, its program, of the same boundary.
 
@@ -201,6 +209,7 @@ def train(
     :param options: what to do besides
     :param callbacks: of SB3, besides those that train and save
     :raises Interrupted: after an interrupt (Ctrl-C), or when a worker process has died; then all is saved
+    :raises Diverged: at a number that is not finite; then the last finite parameters are saved
     """
     checkpoint: _RunCheckpoint | None = None
     callbacks = [*callbacks, *([] if wrapper is None else [wrapper])]
@@ -221,6 +230,8 @@ def train(
         raise _saved(model, folder, checkpoint) from None
     except WorkerDiedError as error:
         raise _saved(model, folder, checkpoint, str(error)) from None
+    except FloatingPointError as error:
+        raise _diverged(model, config, folder, checkpoint, str(error)) from None
     save_results(folder, model)
 
 
@@ -232,6 +243,20 @@ def _saved(model: BaseAlgorithm, folder: Path, checkpoint: _RunCheckpoint | None
             return Interrupted(checkpoint.timesteps, resumable=True, reason=reason)
         save_results(folder, model)
     return Interrupted(model.num_timesteps, resumable=False, reason=reason)
+
+
+def _diverged(
+    model: BaseAlgorithm, config: RunConfig, folder: Path, checkpoint: _RunCheckpoint | None, reason: str
+) -> Diverged:
+    """Save what is finite and return what says so."""
+    reason = reason.rstrip(".")
+    if checkpoint is None and not all(th.isfinite(parameter).all() for parameter in model.policy.parameters()):
+        return Diverged(f"{reason}; the parameters are not saved, for they are not finite")
+    saved = _saved(model, folder, checkpoint)
+    again = f"progpolicy train --algo {config.algo} --env {shlex.quote(config.env)} -i {shlex.quote(str(folder))}"
+    again += "" if saved.resumable else " --allow-pickle"
+    where = f"saved at step {saved.timesteps} in {folder}"
+    return Diverged(f"{reason}; {where}. To train from there with other hyperparameters: {again}")
 
 
 def resume(

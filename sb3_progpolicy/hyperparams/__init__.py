@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import math
+import re
 from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
@@ -13,6 +14,7 @@ import yaml
 from sb3_progpolicy.nearest import unknown
 
 DEFAULT, SEARCH = "default", "search"
+_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
 #: Bounds far above what real files have; damaged or hostile ones would take memory or end in a traceback.
 MAX_CHARACTERS, MAX_ITEMS, MAX_DEPTH = 1_000_000, 10_000, 20
 
@@ -122,7 +124,7 @@ def parse_value(text: str) -> Any:
     :raises ValueError: if it is not YAML, or a number is not finite
     """
     try:
-        value = parse_number(read_yaml(text))
+        value = parse_numbers(parse_number(read_yaml(text)))
         _count_items(value, 0)
     except ValueError as error:
         raise ValueError(f"{shortened(text)} is not accepted; it {error}") from None
@@ -148,6 +150,18 @@ def parse_number(value: Any) -> Any:
     return value
 
 
+def parse_numbers(value: Any) -> Any:
+    """Return a value with what is written as ``1e-3`` in its lists and mappings, which YAML reads as texts, as numbers.
+
+    Other texts stay what they are, ``"12"`` too.
+    """
+    if isinstance(value, Mapping):
+        return {name: parse_numbers(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(parse_numbers(item) for item in value)
+    return float(value) if isinstance(value, str) and _EXPONENT.fullmatch(value) else value
+
+
 def parse_kwargs(name: str, value: Any) -> dict[str, Any]:
     """Return keyword arguments given as a mapping or, as the zoo writes them, as ``"dict(depth=3, cell='gru')"``.
 
@@ -158,7 +172,7 @@ def parse_kwargs(name: str, value: Any) -> dict[str, Any]:
     if value is None:
         return {}
     if isinstance(value, Mapping):
-        parsed: Any = {str(key): parse_number(item) for key, item in value.items()}
+        parsed: Any = {str(key): parse_numbers(parse_number(item)) for key, item in value.items()}
     else:
         try:
             parsed = _literal(ast.parse(value[:MAX_ITEMS], mode="eval").body)
@@ -168,9 +182,17 @@ def parse_kwargs(name: str, value: Any) -> dict[str, Any]:
         given = shortened(value)
         raise ValueError(f"{name}={given} is not accepted; give a mapping or dict(name=value, ...) of literals")
     for key, item in parsed.items():
-        if isinstance(item, float) and not math.isfinite(item):
+        if not _is_finite(item):
             raise ValueError(f"{name}: {key}={item} is not accepted; numbers are finite")
     return parsed
+
+
+def _is_finite(value: Any) -> bool:
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    if isinstance(value, (list, tuple)):
+        return all(map(_is_finite, value))
+    return not isinstance(value, float) or math.isfinite(value)
 
 
 def _literal(node: ast.expr) -> Any:
