@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -40,10 +41,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with tempfile.TemporaryDirectory() as folder:
         sys.argv = [f"rl_zoo3 {given[0]}", *given[1:]]
         algo = _algorithm(given)
-        if given[0] == "train" and algo in _our_methods() and not {"-conf", "--conf-file"} & set(given):
+        if given[0] == "train" and algo in _our_methods():
             file = Path(folder) / f"{algo}.yml"
             file.write_text(yaml.safe_dump(zoo_hyperparams(algo)), encoding="utf-8")
-            sys.argv += ["--conf-file", str(file)]
+            # Before the user's options: of two files the zoo takes the last, however the option is written.
+            sys.argv[1:1] = ["--conf-file", str(file)]
         getattr(command, given[0])()
 
 
@@ -87,12 +89,10 @@ def _our_methods() -> dict[str, Method]:
 
 def _algorithm(arguments: Sequence[str]) -> str | None:
     """Return what ``--algo`` says, as the zoo's parser takes it."""
-    for number, argument in enumerate(arguments):
-        if argument == "--algo":
-            return next(iter(arguments[number + 1 : number + 2]), None)
-        if argument.startswith("--algo="):
-            return argument.removeprefix("--algo=")
-    return None
+    parser = argparse.ArgumentParser(prog="rl_zoo3", add_help=False)
+    parser.add_argument("--algo", default=None)
+    found: str | None = parser.parse_known_args(arguments[1:])[0].algo
+    return found
 
 
 def _reading_schedules(algorithm: type[Any]) -> type[Any]:

@@ -1,5 +1,6 @@
 """rl-baselines3-zoo as a client: training with evaluation, then playing what was saved."""
 
+import argparse
 import subprocess
 import sys
 
@@ -49,6 +50,28 @@ def test_schedule_that_the_zoo_has_no_form_for_is_refused(monkeypatch):
     monkeypatch.setattr("sb3_progpolicy.zoo.load_entries", lambda _: {"default": entry})
     with pytest.raises(ValueError, match=r"default: learning_rate='lin_0.5_0.1' has no form in the zoo"):
         zoo_hyperparams("reptile_ppo")
+
+
+@pytest.mark.parametrize("option", [["--conf-file=mine.yml"], ["--conf", "mine.yml"], ["-conf", "mine.yml"]])
+@pytest.mark.parametrize("algo", [["--algo", "reptile_ppo"], ["--algo=reptile_ppo"], ["--alg", "reptile_ppo"]])
+def test_the_users_own_file_is_read_in_place_of_ours(algo, option, monkeypatch):
+    seen = []
+
+    class Command:
+        @staticmethod
+        def train():
+            parser = argparse.ArgumentParser()
+            parser.add_argument("--algo")
+            parser.add_argument("-conf", "--conf-file")
+            seen.append(parser.parse_args())
+
+    monkeypatch.setattr("sb3_progpolicy.zoo.register", lambda: None)
+    monkeypatch.setattr("sb3_progpolicy.zoo.import_module", lambda _: Command)
+    monkeypatch.setattr(sys, "argv", [])
+    main(["train", *algo, *option])
+    main(["train", *algo])
+    assert seen[0].conf_file == "mine.yml"
+    assert seen[1].conf_file.endswith("reptile_ppo.yml")
 
 
 # In a process of its own: importing the zoo changes Gymnasium's TimeLimit.
