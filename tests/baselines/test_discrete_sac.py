@@ -153,6 +153,18 @@ def test_saved_model_predicts_and_learns_on_alike(tmp_path, ent_coef):
     assert loaded.num_timesteps == 160
 
 
+def test_targets_wait_for_their_interval_across_updates_of_one_gradient_step():
+    model = DiscreteSAC("MlpPolicy", "CartPole-v1", target_update_interval=8, tau=1.0, **SMALL)
+    model.learn(SMALL["learning_starts"] + 1)  # the first gradient step also updates the targets
+    moved = []
+    for _ in range(17):
+        before = [parameter.clone() for parameter in model.critic_target.parameters()]
+        model.train(1, 16)
+        after = model.critic_target.parameters()
+        moved.append(not all(th.equal(one, other) for one, other in zip(before, after, strict=True)))
+    assert [step for step, has_moved in enumerate(moved, 1) if has_moved] == [8, 16]
+
+
 def test_same_seed_trains_the_same():
     first, second = (DiscreteSAC("MlpPolicy", "CartPole-v1", **SMALL).learn(100).get_parameters() for _ in range(2))
     assert all(th.equal(first["policy"][key], second["policy"][key]) for key in first["policy"])

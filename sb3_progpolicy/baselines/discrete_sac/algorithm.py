@@ -230,7 +230,7 @@ class DiscreteSAC(OffPolicyAlgorithm):
             ent_coefs.append(ent_coef.item())
             if self.log_ent_coef is not None:
                 ent_coef_losses.append(self._update_ent_coef(losses.entropy))
-            if step % self.target_update_interval == 0:
+            if (self._n_updates + step) % self.target_update_interval == 0:
                 polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
                 polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
         self._n_updates += gradient_steps
