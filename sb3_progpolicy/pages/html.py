@@ -19,6 +19,7 @@ from sb3_progpolicy.programs.export.grids import blocks_of
 from sb3_progpolicy.programs.export.javascript import escaped_json, export_javascript
 from sb3_progpolicy.programs.export.visitor import action_rule, counted, deliver, input_importance, title
 from sb3_progpolicy.programs.syntax import ProgramData
+from sb3_progpolicy.surroundings import own_env_kwargs
 
 #: In the order in which the page runs them; each uses only what stands before it.
 SCRIPTS = ("worlds", "episode", "dom", "boards", "panda", "program", "reasons", "charts", "inputs", "app")
@@ -42,7 +43,7 @@ def export_html(
 
     :param program: what to show
     :param out_file: a path or an open text file to write to
-    :param env_kwargs: constructor arguments of the environment
+    :param env_kwargs: constructor arguments of the environment; by default those in the program's metadata
     :param seed: of the episodes
     :return: the page if ``out_file`` is ``None``, else ``None``
     :raises ValueError: if the program is not well formed
@@ -54,7 +55,9 @@ def export_html(
         raise ModuleNotFoundError('pages need Jinja2: pip install "sb3-progpolicy[page]"') from error
     source = export_javascript(program)
     domain = find_domain(_env_id(program))
-    with _environment(program, domain, dict(env_kwargs or {})) as env:
+    if env_kwargs is None:
+        env_kwargs = own_env_kwargs(program)
+    with _environment(program, domain, dict(env_kwargs)) as env:
         content = _content(program, env, domain, seed)
     templates = Environment(
         loader=PackageLoader(__package__, "."), autoescape=True, trim_blocks=True, undefined=StrictUndefined
@@ -104,6 +107,7 @@ def _content(program: ProgramData, env: gym.Env[Any, Any] | None, domain: Domain
         in_page = domain.id in WORLDS and context == "hidden"
         data["world"] = domain.id if in_page else "Panda" if hasattr(env.unwrapped, "task") else None
         data["size"] = domain.size
+        data["cap"] = env.spec and env.spec.max_episode_steps
         data["episodes"] = record_episodes(program, env, domain, in_page, seed)
         docstring = inspect.getdoc(type(env.unwrapped)) or ""
         lead = docstring.partition("\n\n")[0].replace("\n", " ") or lead

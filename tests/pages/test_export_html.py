@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sb3_progpolicy import load_pretrained, pretrained_names
+from sb3_progpolicy import ReptilePPO, load_pretrained, pretrained_names
 from sb3_progpolicy.pages import export_html
 from sb3_progpolicy.pages.episodes import pack_numbers
 from sb3_progpolicy.programs import ProgramRunner, explain
@@ -26,7 +26,7 @@ FRAMES = """
         const policy = new ProgramPolicy();
         return data.episodes.map((episode) => {
             const world = WORLDS[data.world];
-            const frames = world ? simulate(policy, new world(episode.start), episode.actions)
+            const frames = world ? simulate(policy, new world(episode.start), data.cap, episode.actions)
                                  : replay(policy, episode);
             return frames.map(({ chosen, action, reward, final, success, conditionValues, outputs, branch, memory }) =>
                 ({ chosen, action, reward, final, success, conditionValues, outputs, branch, memory }));
@@ -106,6 +106,24 @@ def test_a_page_decides_as_the_interpreter_in_every_embedded_episode(name):
             reward, done = np.float32(earned), terminated or truncated
             assert np.float32(frame["reward"]) == reward
     env.close()
+
+
+@pytest.mark.parametrize("given", [True, False], ids=["argument", "metadata"])
+def test_a_page_has_the_cap_of_its_environment(given):
+    kwargs, program = {"max_episode_steps": 20}, load_pretrained("Hanoi-v0")
+    own = replace(program, metadata={**program.metadata, "env_kwargs": kwargs})
+    data, episodes = frames_of(export_html(program, env_kwargs=kwargs) if given else export_html(own))
+    assert data["cap"] == 20
+    for episode, frames in zip(data["episodes"], episodes, strict=True):
+        assert len(frames) - 1 == episode["steps"] <= 20
+        assert frames[-1]["success"] == episode["success"]
+    assert {episode["success"] for episode in data["episodes"]} == {True, False}
+
+
+def test_a_page_shows_the_environment_that_the_program_was_trained_in():
+    model = ReptilePPO("PRLPolicy", "Hanoi-v0", env_kwargs={"context": "observed"}, n_envs=2, n_steps=8, seed=0)
+    page = export_html(model.program())  # with the numbers of the variation in its observations
+    assert json.loads(Elements(page).scripts[0])["episodes"]
 
 
 def test_a_page_loads_nothing_and_has_keys_labels_and_two_colour_schemes():

@@ -76,6 +76,20 @@ def test_a_page_opens_without_an_error_or_a_request_and_fits_the_screen(name, lo
     assert (max(levels) < 60) == bool(look.get("dark"))
 
 
+@pytest.mark.parametrize(
+    "place", ["episode=x", "episode=-1", "episode=1.5", "episode=", "step=x", "step=-3", "step=1.5"]
+)
+def test_an_odd_address_is_as_if_it_were_not_there(place, visit, tab):
+    program = load_pretrained("Hanoi-v0")
+    visit(program)
+    usual = tab.evaluate("[page.index, page.t]")
+    visit(program, place)
+    assert tab.errors == []
+    assert tab.evaluate("[page.index, page.t]") == usual
+    visit(program, "episode=99&step=9999")
+    assert tab.evaluate(f"page.index === page.data.episodes.length - 1 && {T} === {LAST}")
+
+
 def test_keys_step_forward_back_to_the_ends_and_play(visit, tab):
     visit(load_pretrained("Hanoi-v0"))
     last = tab.evaluate(LAST)

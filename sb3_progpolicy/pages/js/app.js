@@ -31,12 +31,12 @@ class Page {
     const last = this.data.episodes.length - 1;
     if (last >= 0) {
       this.makeVariations(last);
-      this.open(Math.min(Number(wish.get("episode") ?? this.firstEpisode()), last));
+      this.open(Math.min(wholeNumber(wish.get("episode"), this.firstEpisode()), last));
     } else {
       this.makeQuestion();
       this.ask([new Array(this.program.nObservations).fill(0)], 0);
     }
-    this.seek(Number(wish.get("step") || 0));
+    this.seek(wholeNumber(wish.get("step"), 0));
   }
 
   // The largest training variation: long enough to be worth a look.
@@ -49,7 +49,7 @@ class Page {
     const world = WORLDS[this.data.world];
     Object.assign(this, { index, episode, edited: false, selected: null, scene: null });
     this.frames = world
-      ? simulate(this.policy, new world(episode.start), episode.actions)
+      ? simulate(this.policy, new world(episode.start), this.data.cap, episode.actions)
       : replay(this.policy, episode);
     if (episode.scene) this.scene = readScene(episode);
     this.begin(0);
@@ -58,7 +58,7 @@ class Page {
   // Let the program act from a state that the reader has made.
   edit(state) {
     Object.assign(this, { edited: true, selected: null });
-    this.frames = simulate(this.policy, new WORLDS[this.data.world](state));
+    this.frames = simulate(this.policy, new WORLDS[this.data.world](state), this.data.cap);
     this.begin(0);
     this.announce(`Your state. ${this.ending()}`);
   }
@@ -245,6 +245,11 @@ class Page {
     this.selected = thing;
     this.show();
   }
+}
+
+// A number that an address asks for; what is not one from 0 on is as if it were not there.
+function wholeNumber(text, otherwise) {
+  return /^\d+$/.test(text ?? "") ? Number(text) : otherwise;
 }
 
 // {n_discs: 3, layout: "comb"} as "3 discs, comb".

@@ -1,15 +1,17 @@
 // Episodes as frames: what the program reads, decides and gets at each step.
 
-const MAX_STEPS = 500; // as the environments are registered
-
 // Run the program in a world until the goal or the cap. The rewards that it reads are of 32 bits, as in training.
 //
-// recorded: actions that were taken in place of the program's own, if given
-function simulate(policy, world, recorded = null) {
+// cap: steps after which an episode has failed
+// recorded: actions that were taken in place of the program's own, if given; the episode is as long as they are
+function simulate(policy, world, cap, recorded = null) {
   policy.reset();
   const frames = [];
   let before = { action: null, reward: 0, done: false };
-  while (!world.isSolved() && frames.length < MAX_STEPS) {
+  const goesOn = recorded
+    ? () => frames.length < recorded.length
+    : () => !world.isSolved() && frames.length < cap;
+  while (goesOn()) {
     const frame = decide(policy, world.observe(), before);
     frame.state = snapshot(world.state);
     if (recorded) frame.action = recorded[frames.length];
