@@ -69,9 +69,10 @@ def test_a_file_that_is_read_is_not_overwritten(tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["program.json"]
 
 
-def test_a_plan_without_a_step_is_filmed(tmp_path, capsys):
+def test_a_start_without_a_step_to_take_is_not_filmed(tmp_path, capsys):
     arguments = ["render", "Hanoi-v0", "--planner", "--set", "n_discs=2", "discs=[2,2]", "target=2", "-o"]
-    assert run([*arguments, str(tmp_path / "s.gif")]) == 0
+    assert run([*arguments, str(tmp_path / "s.gif")]) == 2
+    assert "nothing is left to be done there" in capsys.readouterr().err
 
 
 def test_activity_shows_the_program_as_it_acts(tmp_path):
