@@ -132,14 +132,17 @@ DOMAINS: dict[str, Domain] = {
             validation=({"n_discs": 5},),
             unseen=tuple({"n_discs": n_discs} for n_discs in (6, 7, 8)),
         ),
-        Domain(
-            id="Hiking-v0",
-            entry_point="progpolicy_envs.hiking:HikingEnv",
-            vector_entry_point="progpolicy_envs.hiking:HikingVectorEnv",
-            size="n_stars",
-            train=tuple({"n_stars": n_stars} for n_stars in (1, 2, 3, 4)),
-            validation=({"n_stars": 5},),
-            unseen=tuple({"n_stars": n_stars} for n_stars in (6, 7, 8, 9, 10)),
+        *(
+            Domain(
+                id=f"Hiking-{version}",
+                entry_point=f"progpolicy_envs.hiking:{name}Env",
+                vector_entry_point=f"progpolicy_envs.hiking:{name}VectorEnv",
+                size="n_stars",
+                train=tuple({"n_stars": n_stars} for n_stars in (1, 2, 3, 4)),
+                validation=({"n_stars": 5},),
+                unseen=tuple({"n_stars": n_stars} for n_stars in (6, 7, 8, 9, 10)),
+            )
+            for version, name in (("v0", "HikingV0"), ("v1", "Hiking"))
         ),
         # From the hiker's point of view: what is learned on generated maps is tested on others. On a few maps the
         # window tells where the hiker is, and what is learned is these maps by heart.

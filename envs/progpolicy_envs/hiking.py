@@ -1,4 +1,4 @@
-"""Hiking-v0 and HikingEgo-v0: collect the stars of a map that is seen as a whole, or from the hiker's own place."""
+"""Hiking-v1 and HikingEgo-v0: collect the stars of a map that is seen as a whole, or from the hiker's own place."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progpolicy_envs.documentation import with_sections
+from progpolicy_envs.hikes import MAX_STARS
 from progpolicy_envs.layouts import DIRECTIONS, N_CELLS, N_COLUMNS, N_ROWS
 from progpolicy_envs.pathways import MapView, PathwayEnv, PathwayVectorEnv
 from progpolicy_envs.symmetry import Grid, Permutation, Symmetry
@@ -31,15 +32,25 @@ _WINDOW_OFFSETS = np.array([down * _FRAME_WIDTH + right for down, right in _WIND
 
 
 class _WholeMap(MapView):
-    """The map as Hiking-v0 shows it."""
+    """The map as Hiking-v1 shows it: all stars that are left count together what one alone does."""
 
-    star_value: ClassVar[float] = 0.0625
+    star_value: ClassVar[float] = 0.25
     hiker_value: ClassVar[float] = 1.0
     n_numbers: ClassVar[int] = N_CELLS
     places: ClassVar[NDArray[np.int64]] = np.arange(N_CELLS)
     observation_names: tuple[str, ...] = tuple(
         f"map[{row},{column}]" for row in range(N_ROWS) for column in range(N_COLUMNS)
     )
+    #: The number of a star by how many are left.
+    shares: ClassVar[NDArray[np.float32]] = np.array(
+        [0.0, *(0.25 / n_left for n_left in range(1, MAX_STARS + 1))], np.float32
+    )
+
+
+class _FirstWholeMap(_WholeMap):
+    """The map as Hiking-v0 shows it: every star counts the same."""
+
+    star_value: ClassVar[float] = 0.0625
 
 
 class _FramedMap(MapView):
@@ -123,9 +134,64 @@ def _refuse_observation(observation: object) -> None:
         )
 
 
-@with_sections(_SECTIONS, id="Hiking-v0")
+@with_sections(_SECTIONS, id="Hiking-v1")
 class HikingEnv(_WholeMap, PathwayEnv):
     """Walk the pathways of a map, seen as a whole, and collect every star.
+
+    $task
+
+    ## Observation Space
+    ``Box(-1, 1, (80,))``, one number for each cell of the map, row by row from the north-west corner:
+    ``map[row,column]`` is number ``10 * row + column``. The window around the hiker is another environment,
+    ``HikingEgo-v0``.
+
+    | Cell                   | Number                                        |
+    |------------------------|-----------------------------------------------|
+    | rock, water            | -1                                            |
+    | pathway                | 0                                             |
+    | pathway with a star    | 1/4 divided by the number of stars left       |
+    | pathway with the hiker | 1                                             |
+
+    ### What a short program can do with it
+    A weighted sum over the cells sees the hiker and the stars through the same weights: with the hiker at p and n stars
+    left at q, the sum of w is ``w[p] + 1/4 * mean of w[q]`` plus a constant of the map. So on a known map a controller
+    is a table "what to do where", disturbed by the mean over the stars' cells, as much by ten stars as by one. In
+    ``Hiking-v0`` each star counted 1/16, so that more stars than in training disturbed more.
+
+    With a branch for each previous action (four controllers, three conditions) entries are needed only where the
+    right-hand rule does not go straight on: bends, forks and ends, at most six for each heading and turn on the
+    hand-drawn maps. With the constant 1 for straight on and entries of 2, the stars disturb by at most 1/2. A table is
+    good for one map; for maps never seen, use ``HikingEgo-v0``.
+
+    $rules
+
+    ## Version History
+    * v1: the stars that are left share 1/4; each was 1/16
+    * v0: initial version; the egocentric observation has become ``HikingEgo-v0``
+    """
+
+    grids: ClassVar[tuple[Grid, ...]] = (Grid.whole("map", 0, N_ROWS, N_COLUMNS),)
+
+    def __init__(
+        self,
+        n_stars: int = 3,
+        layout: str | Sequence[str] = "valley",
+        render_mode: str | None = None,
+        context: str = "hidden",
+        observation: None = None,
+        n_done: int | str = 0,
+    ) -> None:
+        _refuse_observation(observation)
+        super().__init__(n_stars, layout, render_mode, context, n_done)
+
+    def _seen(self, numbers: NDArray[np.float32]) -> NDArray[np.float32]:
+        numbers[self.places[list(self.stars)]] = self.shares[len(self.stars)]
+        return numbers
+
+
+@with_sections(_SECTIONS, id="Hiking-v0")
+class HikingV0Env(_FirstWholeMap, PathwayEnv):
+    """Walk the pathways of a map, seen as a whole, and collect every star; ``Hiking-v1`` shows the stars better.
 
     $task
 
@@ -216,6 +282,27 @@ class HikingEgoEnv(_FramedMap, PathwayEnv):
 
 class HikingVectorEnv(_WholeMap, PathwayVectorEnv):
     """N :class:`HikingEnv`; see :class:`PathwayVectorEnv`."""
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        n_stars: int = 3,
+        layout: str | Sequence[str] = "valley",
+        max_episode_steps: int | None = None,
+        context: str = "hidden",
+        observation: None = None,
+        n_done: int | str = 0,
+    ) -> None:
+        _refuse_observation(observation)
+        super().__init__(num_envs, n_stars, layout, max_episode_steps, context, n_done)
+
+    def _observe(self) -> NDArray[np.float32]:
+        share = self.shares[self._stars_left][:, None]
+        return np.where(self._numbers == self.star_value, share, self._numbers)
+
+
+class HikingV0VectorEnv(_FirstWholeMap, PathwayVectorEnv):
+    """N :class:`HikingV0Env`; see :class:`PathwayVectorEnv`."""
 
     def __init__(
         self,

@@ -16,7 +16,7 @@ from sb3_progpolicy.programs.syntax import ProgramData
 from sb3_progpolicy.spaces import action_spec
 
 #: The planning environments that a page can step by itself, see ``js/worlds.js``.
-WORLDS = ("Hanoi-v0", "Stacking-v0", "Hiking-v0", "HikingEgo-v0")
+WORLDS = ("Hanoi-v0", "Stacking-v0", "Hiking-v1", "Hiking-v0", "HikingEgo-v0")
 #: Bytes of recorded observations that a page holds at most; what comes after is left out.
 MAX_BYTES = 600_000
 

@@ -10,7 +10,7 @@ from progpolicy_envs import DOMAINS, MAX_EPISODE_STEPS, Domain, get_domain, regi
 
 SIZES = {
     "Hanoi-v0": ({1, 2, 3, 4}, {5}, {6, 7, 8}),
-    "Hiking-v0": ({1, 2, 3, 4}, {5}, {6, 7, 8, 9, 10}),
+    **{f"Hiking-{version}": ({1, 2, 3, 4}, {5}, {6, 7, 8, 9, 10}) for version in ("v0", "v1")},
     "HikingEgo-v0": ({1, 2, 3, 4}, {5}, {5, 6, 7, 8, 9, 10}),
     "Stacking-v0": ({1, 2, 3, 4}, {5}, {6, 7, 8}),
     **{f"Panda{task}-v0": ({1, 2, 3}, {4}, {5, 6, 7, 8}) for task in ("Reach", "Push", "Slide", "Stack")},

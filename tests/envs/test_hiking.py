@@ -1,4 +1,4 @@
-"""Hiking-v0: maps, tours and observations, and the right-hand rule written as a program."""
+"""Hiking: maps, tours and observations, and the right-hand rule written as a program."""
 
 from collections import Counter, deque
 from itertools import permutations, product
@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from progpolicy_envs.hiking import HikingEgoEnv, HikingEnv
+from progpolicy_envs.hiking import HikingEgoEnv, HikingEnv, HikingV0Env
 from progpolicy_envs.layouts import LAYOUTS, N_RANDOM_LAYOUTS, NEIGHBOURS, Layout, random_layout
 from progpolicy_envs.planners import hiking as planner
 from sb3_progpolicy.programs.syntax import Program
@@ -23,7 +23,8 @@ from tests.handwritten.evaluate import Player, play, play_batch, size_of
 from tests.handwritten.hiking import egocentric_program, map_program, turns
 
 NORTH, EAST, SOUTH, WEST = range(4)
-ENVS = {"Hiking-v0": HikingEnv, "HikingEgo-v0": HikingEgoEnv}
+ENVS = {"Hiking-v0": HikingV0Env, "Hiking-v1": HikingEnv, "HikingEgo-v0": HikingEgoEnv}
+WHOLE_MAPS = ("Hiking-v0", "Hiking-v1")
 SAMPLE = [*LAYOUTS.values(), *(random_layout(number) for number in range(0, N_RANDOM_LAYOUTS, 16))]
 
 
@@ -193,11 +194,11 @@ def assert_observation_shows(
         inside = 0 <= row < 8 and 0 <= column < 10
         value = 0.0 if inside and rows[row][column] in ".H" else -1.0
         if (row, column) in stars:
-            value = 1 / 16 if env_id == "Hiking-v0" else 1.0
+            value = {"Hiking-v0": 1 / 16, "Hiking-v1": np.float32(1 / (4 * len(stars)))}.get(env_id, 1.0)
         if (row, column) == hiker:
             value = 1.0
         down, right = row - hiker[0], column - hiker[1]
-        if env_id == "Hiking-v0" and inside:
+        if env_id in WHOLE_MAPS and inside:
             assert named[f"map[{row},{column}]"] == value
         elif env_id == "HikingEgo-v0" and max(abs(down), abs(right)) <= 4 and (down or right):
             assert named[f"window[{down:+d},{right:+d}]"] == value
@@ -224,10 +225,11 @@ def test_handwritten_egocentric_program_collects_all_stars_on_every_map(layout: 
 
 
 @pytest.mark.parametrize("n_stars", [1, 2, 3, 4, 5, 7, 10, 12])
-def test_handwritten_map_program_solves_training_and_unseen_variations(n_stars: int) -> None:
-    program = map_program("valley")
+@pytest.mark.parametrize("env_id", WHOLE_MAPS)
+def test_handwritten_map_program_solves_training_and_unseen_variations(env_id: str, n_stars: int) -> None:
+    program = map_program("valley", env_id)
     assert size_of(program) == (3, 4)
-    episodes = play_batch(program, "Hiking-v0", 100, layout="valley", n_stars=n_stars)
+    episodes = play_batch(program, env_id, 100, layout="valley", n_stars=n_stars)
     assert all(episode.success for episode in episodes)
     round_trip = 2 * int(LAYOUTS["valley"].is_path.sum() - 1)
     assert all(episode.optimal <= episode.steps <= round_trip for episode in episodes)
@@ -235,7 +237,7 @@ def test_handwritten_map_program_solves_training_and_unseen_variations(n_stars: 
 
 @pytest.mark.parametrize(
     ("env_id", "layout", "program"),
-    [("HikingEgo-v0", "random", egocentric_program()), ("Hiking-v0", "valley", map_program("valley"))],
+    [("HikingEgo-v0", "random", egocentric_program()), ("Hiking-v1", "valley", map_program("valley"))],
 )
 def test_handwritten_programs_go_on_when_their_history_survives_episodes(
     env_id: str, layout: str, program: Program
@@ -249,7 +251,20 @@ def test_handwritten_programs_go_on_when_their_history_survives_episodes(
 def test_stars_never_outweigh_the_hiker_in_the_map_program(layout: str) -> None:
     for heading in range(4):
         agreeing = max(Counter(turns(LAYOUTS[layout], heading).values()).values(), default=0)
-        assert 2.0 * HikingEnv.star_value * agreeing < 1.0
+        assert 2.0 * HikingV0Env.star_value * agreeing < 1.0
+    assert 2.0 * HikingEnv.star_value < 1.0, "all stars together"
+
+
+def test_stars_share_a_quarter_as_they_are_collected() -> None:
+    env = gym.make("Hiking-v1", n_stars=7, layout="fork")
+    observation, _ = env.reset(seed=0)
+    seen = [float(observation[(observation > 0) & (observation < 1)].sum())]
+    for action in env.unwrapped.plan():
+        observation, *_ = env.step(action)
+        seen.append(float(observation[(observation > 0) & (observation < 1)].sum()))
+    np.testing.assert_allclose(seen[:-1], 0.25, rtol=1e-6)
+    assert seen[-1] == 0
+    assert observation.max() == 1
 
 
 def test_positions_follow_the_seed_and_change_from_episode_to_episode() -> None:
@@ -308,11 +323,11 @@ def test_picture_shows_the_state() -> None:
 
 
 def test_window_opens_shows_and_closes() -> None:
-    assert_window_opens_shows_and_closes("Hiking-v0")
+    assert_window_opens_shows_and_closes("Hiking-v1")
 
 
 @pytest.mark.parametrize(("n_stars", "layout"), [(1, "valley"), (12, "random"), (12, "spiral")])
-@pytest.mark.parametrize("env_id", ENVS)
+@pytest.mark.parametrize("env_id", sorted({*ENVS} - {"Hiking-v0"}))  # Gymnasium warns of an old version
 def test_environment_checkers_find_nothing(n_stars: int, layout: str, env_id: str) -> None:
     assert_checkers_are_silent(env_id, n_stars=n_stars, layout=layout)
 
@@ -339,8 +354,8 @@ def test_map_of_the_user_is_walked_and_stars_lie_where_they_are_marked(env_id: s
     assert info["optimal_steps"] == 2 + 2 + 3 + 1
     assert env.render().splitlines() == ["H...######", ".##*######", "*#~~~#####", *["##########"] * 5]
     named = dict(zip(env.unwrapped.observation_names, observation, strict=True))
-    seen = named["map[2,0]"] if env_id == "Hiking-v0" else named["window[+2,+0]"]
-    assert seen == env.unwrapped.star_value
+    seen = named["map[2,0]"] if env_id in WHOLE_MAPS else named["window[+2,+0]"]
+    assert seen == (1 / 8 if env_id == "Hiking-v1" else env.unwrapped.star_value)
     results = [env.step(action) for action in env.unwrapped.plan()]
     assert [result[2] for result in results] == [False] * 7 + [True]
 

@@ -9,7 +9,7 @@ import pytest
 
 from progpolicy_envs import DOMAINS
 
-PLANNING = ("Hiking-v0", "HikingEgo-v0", "Stacking-v0")
+PLANNING = ("Hiking-v0", "Hiking-v1", "HikingEgo-v0", "Stacking-v0")
 PANDA = ("PandaReach-v0", "PandaPush-v0", "PandaSlide-v0", "PandaStack-v0")
 
 

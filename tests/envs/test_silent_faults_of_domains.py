@@ -87,7 +87,7 @@ def test_options_of_one_environment_alone():
     assert venv.env_method("state_of", 0)[0]["gripper"] == [0, 0]
 
 
-@pytest.mark.parametrize("env_id", ["Hiking-v0", "HikingEgo-v0"])
+@pytest.mark.parametrize("env_id", ["Hiking-v0", "Hiking-v1", "HikingEgo-v0"])
 def test_what_is_drawn_makes_room_for_what_is_given(env_id):
     env, many = gym.make(env_id), batch(env_id, 1)
     known = [list(cell) for cell in env.reset(seed=0) and env.unwrapped.state["stars"]]

@@ -34,6 +34,7 @@ def draw_stacking(generator: np.random.Generator, num_envs: int) -> dict[str, An
 CASES: dict[str, Draw] = {
     "Hanoi-v0": draw_hanoi,
     "Hiking-v0": draw_hiking,
+    "Hiking-v1": draw_hiking,
     "HikingEgo-v0": draw_hiking,
     "Stacking-v0": draw_stacking,
 }

@@ -43,12 +43,12 @@ def turns(layout: Layout, heading: int) -> dict[int, int]:
     return {cell: way for cell, way in ways.items() if way != heading}
 
 
-def map_program(layout: str = "valley") -> Program:
+def map_program(layout: str = "valley", env_id: str = "Hiking-v1") -> Program:
     """Return the right-hand rule of one map as a table: a branch for each previous action.
 
     In the branch of a heading, straight on has the constant 1 and the hiker on a turning cell adds 2 to its way.
-    A star on another turning cell of the branch adds an eighth to that cell's way, which does no harm while fewer
-    than eight of them agree.
+    In Hiking-v1 all stars on other turning cells of the branch add at most a half to the ways of these, which does no
+    harm. In Hiking-v0 each adds an eighth, which does none while fewer than eight of them agree.
     """
     builder = Builder(HikingEnv())
     controllers = []
@@ -59,4 +59,4 @@ def map_program(layout: str = "valley") -> Program:
         controllers.append(builder.controller(scores, bias={name: 1.0}))
     came_from = [builder.affine({f"previous {name}": 1.0}, -0.5) for name in ACTION_NAMES[:-1]]
     body = builder.chain(list(zip(came_from, controllers[:-1], strict=True)), controllers[-1])
-    return builder.program(body, env="Hiking-v0", layout=layout)
+    return builder.program(body, env=env_id, layout=layout)

@@ -71,7 +71,7 @@ def shipped_pages():
 PAGES = {
     **shipped_pages(),
     "a random recurrent program for Hanoi-v0": lambda: hanoi_program(3, "gru"),
-    "Hiking-v0 by hand": map_program,
+    "Hiking-v1 by hand": map_program,
     "HikingEgo-v0 by hand": egocentric_program,
     "PandaStack-v0 by hand": PROGRAMS["PandaStack-v0"],
 }

@@ -22,7 +22,7 @@ from tests.programs.test_min import grip
 SMALL_STACKING = Path(__file__).parents[2] / "benchmarks" / "results" / "simplified" / "Stacking-v0.json"
 PAGES = {
     **{name: lambda name=name: load_pretrained(name) for name in pretrained_names()},
-    "Hiking-v0": map_program,
+    "Hiking-v1": map_program,
     "HikingEgo-v0": egocentric_program,
     "small Stacking-v0": lambda: load_program(SMALL_STACKING),
     "table": lambda: on_a_grid(OTHER, -3.0, 1.5),
@@ -203,7 +203,7 @@ def test_gripper_and_plates_are_placed_by_clicks(visit, tab):
     assert tab.errors == []
 
 
-@pytest.mark.parametrize("name", ["Hiking-v0", "HikingEgo-v0"])
+@pytest.mark.parametrize("name", ["Hiking-v1", "HikingEgo-v0"])
 def test_hiker_and_stars_are_placed_by_clicks(name, visit, tab):
     visit(PAGES[name]())
     state = tab.evaluate("page.frames[0].state")

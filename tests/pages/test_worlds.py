@@ -59,6 +59,7 @@ def hiking_state(rng):
 STATES = {
     "Hanoi-v0": hanoi_state,
     "Stacking-v0": stacking_state,
+    "Hiking-v1": hiking_state,
     "Hiking-v0": hiking_state,
     "HikingEgo-v0": hiking_state,
 }

@@ -25,7 +25,7 @@ DOMAIN_PROGRAMS = {
     "Stacking-v0 shipped": lambda: load_pretrained("Stacking-v0"),
     "PandaReach-v0 shipped": lambda: load_pretrained("PandaReach-v0"),
     "Hanoi-v0": handwritten_hanoi,
-    "Hiking-v0": map_program,
+    "Hiking-v1": map_program,
     "HikingEgo-v0": egocentric_program,
     "Stacking-v0": stacking_program,
     **PROGRAMS,

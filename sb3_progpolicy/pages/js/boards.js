@@ -178,7 +178,7 @@ BOARDS["Stacking-v0"] = {
   },
 };
 
-BOARDS["Hiking-v0"] = {
+BOARDS["Hiking-v1"] = {
   hint:
     "Change the state: click a pathway cell to add or remove a star. Click the hiker, then a cell, to move the hiker.",
   seesWindow: false,
@@ -245,4 +245,5 @@ BOARDS["Hiking-v0"] = {
   },
 };
 
-BOARDS["HikingEgo-v0"] = { ...BOARDS["Hiking-v0"], seesWindow: true };
+BOARDS["Hiking-v0"] = BOARDS["Hiking-v1"];
+BOARDS["HikingEgo-v0"] = { ...BOARDS["Hiking-v1"], seesWindow: true };

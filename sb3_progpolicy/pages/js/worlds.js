@@ -118,8 +118,13 @@ class Hiking {
     const { hiker } = this.state;
     return this.cells(0, 0, Hiking.nRows, Hiking.nColumns).map(([row, column]) => {
       if (row === hiker[0] && column === hiker[1]) return 1;
-      return this.number(row, column, 0.0625);
+      return this.number(row, column, this.share());
     });
+  }
+
+  // The number of a star: all that are left share a quarter.
+  share() {
+    return Math.fround(0.25 / Math.max(1, this.state.stars.length));
   }
 
   number(row, column, star) {
@@ -150,6 +155,12 @@ class Hiking {
   }
 }
 
+class HikingV0 extends Hiking {
+  share() {
+    return 0.0625;
+  }
+}
+
 class HikingEgo extends Hiking {
   static reach = 4;
 
@@ -163,5 +174,11 @@ class HikingEgo extends Hiking {
   }
 }
 
-const WORLDS = { "Hanoi-v0": Hanoi, "Stacking-v0": Stacking, "Hiking-v0": Hiking, "HikingEgo-v0": HikingEgo };
+const WORLDS = {
+  "Hanoi-v0": Hanoi,
+  "Stacking-v0": Stacking,
+  "Hiking-v1": Hiking,
+  "Hiking-v0": HikingV0,
+  "HikingEgo-v0": HikingEgo,
+};
 if (typeof module !== "undefined" && module.exports) module.exports = { WORLDS };
