@@ -90,8 +90,10 @@ def controller_figures(env_id: str) -> list[str]:
 
 
 def page_name(env_id: str) -> str:
-    """Return ``hanoi`` for ``Hanoi-v0``."""
-    return env_id.rpartition("-v")[0].lower()
+    """Return ``hanoi`` for ``Hanoi-v0``; of several versions an older one has its number, as ``hiking_v0``."""
+    name, _, version = env_id.rpartition("-v")
+    versions = [other.rpartition("-v")[2] for other in DOMAINS if other.startswith(f"{name}-v")]
+    return name.lower() if version == max(versions, key=int) else f"{name.lower()}_v{version}"
 
 
 def write_environment_pages(app: object) -> None:

@@ -17,7 +17,14 @@ from progpolicy_envs import Domain, find_domain
 from sb3_progpolicy.pages.episodes import WORLDS, fits, record_episodes
 from sb3_progpolicy.programs.export.grids import blocks_of
 from sb3_progpolicy.programs.export.javascript import escaped_json, export_javascript
-from sb3_progpolicy.programs.export.visitor import action_rule, counted, deliver, input_importance, title
+from sb3_progpolicy.programs.export.visitor import (
+    action_rule,
+    counted,
+    deliver,
+    input_importance,
+    simplified_as,
+    title,
+)
 from sb3_progpolicy.programs.syntax import ProgramData
 from sb3_progpolicy.surroundings import own_env_kwargs
 
@@ -145,6 +152,8 @@ def _facts(program: ProgramData) -> list[str]:
         f"reads {counted(program.n_inputs, 'number')}",
         f"{np.count_nonzero(numbers)} of {counted(len(numbers), 'weight')} not zero",
     ]
+    for sentence in simplified_as(program):
+        facts.append(sentence.rstrip(".") + "; what was learnt may do otherwise in states that training does not meet")
     timesteps = program.metadata.get("timesteps")
     if isinstance(timesteps, int) and timesteps > 0:
         facts.append(f"trained for {timesteps:,} steps".replace(",", "\N{NARROW NO-BREAK SPACE}"))

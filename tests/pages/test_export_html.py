@@ -145,6 +145,12 @@ def test_a_page_explains_the_inputs_in_the_words_of_the_environment():
     assert "Move a tower of discs" in page
 
 
+def test_a_page_says_that_its_program_was_simplified():
+    words = "what was learnt may do otherwise in states that training does not meet"
+    assert words in export_html(load_pretrained("HikingEgo-v0"))
+    assert words not in export_html(load_pretrained("Hanoi-v0"))
+
+
 def test_no_text_of_a_program_becomes_markup_or_code_of_its_page():
     rng = np.random.default_rng(0)
     for _ in range(25):
