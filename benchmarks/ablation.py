@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from domain_seeds import COLUMNS, Row, run_seed
+from domain_seeds import COLUMNS, Job, Row, run_seed
 from rich.console import Console
 from rich.table import Table
 from study import RESULTS, commit, pool, settings_of, write_results
@@ -29,7 +29,9 @@ from study import RESULTS, commit, pool, settings_of, write_results
 from sb3_progpolicy.experiment.config import make_config
 from sb3_progpolicy.hyperparams import load_hyperparams
 
-BASE = "base"  # what is shipped for HikingEgo; for PandaPush what was shipped before this study: without ties
+BASE = (
+    "base"  # what is shipped for HikingEgo; for PandaPush what was shipped before this study: without ties, `left` read
+)
 
 
 def _with_policy(env_id: str, **changes: Any) -> dict[str, Any]:
@@ -55,7 +57,7 @@ def variants_of(env_id: str) -> Mapping[str, Mapping[str, Any]]:
             "search": _with_policy(env_id, n_conditions=None, depth=3),
         }
     # Shorter than as shipped: an hour and a half of one core for each variant otherwise.
-    base = {"n_timesteps": 400_000, "symmetric": False}
+    base: dict[str, Any] = {"n_timesteps": 400_000, "symmetric": False, "ignore": []}
     variants = {
         BASE: {},
         "mixed means": _with_policy(env_id, semantics="means"),
@@ -69,10 +71,10 @@ def variants_of(env_id: str) -> Mapping[str, Mapping[str, Any]]:
     return {name: {**base, **changes} for name, changes in variants.items()}
 
 
-def run_variant(job: tuple[str, str, tuple[Any, ...]]) -> list[Row]:
+def run_variant(job: tuple[str, str, Job]) -> list[Row]:
     """Train and evaluate one seed of a variant."""
     variant, settings, arguments = job
-    return [{"variant": variant, **row, "settings": settings} for row in run_seed(arguments)]  # type: ignore[arg-type]
+    return [{"variant": variant, **row, "settings": settings} for row in run_seed(arguments)]
 
 
 def known_rows(path: Path) -> list[Row]:
@@ -121,13 +123,15 @@ def main() -> None:
     for seed, variant in product(range(options.seeds), asked):
         overrides, folder = dict(variants[variant]), Path("runs") / name / variant.replace(" ", "_")
         _, settings = settings_of(make_config("reptile_ppo", options.env, seed, overrides=overrides))
-        jobs.append((variant, settings, (options.env, seed, folder, overrides, options.episodes, False, False)))
+        jobs.append(
+            (variant, settings, Job(options.env, seed, folder, overrides, options.episodes, False, False, loaded))
+        )
         wanted.add((variant, str(seed), settings, str(options.episodes)))
     known = known_rows(path)
     done = {tuple(row[key] for key in ("variant", "seed", "settings", "episodes")) for row in known} & wanted
     kept = {(variant, seed) for variant, seed, _, _ in done}
     rows: list[Row] = [row for row in known if row["variant"] not in asked or (row["variant"], row["seed"]) in kept]
-    left = [job for job in jobs if (job[0], str(job[2][1])) not in kept]
+    left = [job for job in jobs if (job[0], str(job[2].seed)) not in kept]
     with pool(options.workers) as workers:
         for found in workers.imap_unordered(run_variant, left):
             rows += [{**row, "commit": loaded} for row in found]

@@ -1,4 +1,4 @@
-"""Read a program, write it in every format, and run the exported file, which needs no torch and no NumPy."""
+"""Read a program, write it in several formats, and run the exported file, which needs no torch and no NumPy."""
 
 from __future__ import annotations
 
