@@ -153,7 +153,8 @@ def _facts(program: ProgramData) -> list[str]:
         f"{np.count_nonzero(numbers)} of {counted(len(numbers), 'weight')} not zero",
     ]
     for sentence in simplified_as(program):
-        facts.append(sentence.rstrip(".") + "; what was learnt may do otherwise in states that training does not meet")
+        facts += [part[0].lower() + part[1:] for part in sentence.rstrip(".").split("; ")]
+        facts.append("what was learnt may differ beyond training")
     timesteps = program.metadata.get("timesteps")
     if isinstance(timesteps, int) and timesteps > 0:
         facts.append(f"trained for {timesteps:,} steps".replace(",", "\N{NARROW NO-BREAK SPACE}"))

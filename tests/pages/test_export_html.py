@@ -146,7 +146,7 @@ def test_a_page_explains_the_inputs_in_the_words_of_the_environment():
 
 
 def test_a_page_says_that_its_program_was_simplified():
-    words = "what was learnt may do otherwise in states that training does not meet"
+    words = "what was learnt may differ beyond training"
     assert words in export_html(load_pretrained("HikingEgo-v0"))
     assert words not in export_html(load_pretrained("Hanoi-v0"))
 
