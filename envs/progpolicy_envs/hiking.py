@@ -51,6 +51,7 @@ class _FirstWholeMap(_WholeMap):
     """The map as Hiking-v0 shows it: every star counts the same."""
 
     star_value: ClassVar[float] = 0.0625
+    shares: ClassVar[NDArray[np.float32]] = np.full(MAX_STARS + 1, star_value, np.float32)
 
 
 class _FramedMap(MapView):
@@ -190,15 +191,13 @@ class HikingEnv(_WholeMap, PathwayEnv):
 
 
 @with_sections(_SECTIONS, id="Hiking-v0")
-class HikingV0Env(_FirstWholeMap, PathwayEnv):
+class HikingV0Env(_FirstWholeMap, HikingEnv):
     """Walk the pathways of a map, seen as a whole, and collect every star; ``Hiking-v1`` shows the stars better.
 
     $task
 
     ## Observation Space
-    ``Box(-1, 1, (80,))``, one number for each cell of the map, row by row from the north-west corner:
-    ``map[row,column]`` is number ``10 * row + column``. The window around the hiker is another environment,
-    ``HikingEgo-v0``.
+    ``Box(-1, 1, (80,))``, as in ``Hiking-v1``, but for the stars:
 
     | Cell                   | Number |
     |------------------------|--------|
@@ -208,38 +207,15 @@ class HikingV0Env(_FirstWholeMap, PathwayEnv):
     | pathway with the hiker | 1      |
 
     ### What a short program can do with it
-    A weighted sum over the cells sees the hiker and the stars through the same weights: with the hiker at p and stars
-    at q, the sum of w is ``w[p] + 1/16 * sum of w[q]`` plus a constant of the map. So on a known map a controller is a
-    table "what to do where", disturbed by the stars that lie on cells with another entry. A star counts little beside
-    the hiker so that many stars do not outweigh where the hiker is.
-
-    With a branch for each previous action (four controllers, three conditions) entries are needed only where the
-    right-hand rule does not go straight on: bends, forks and ends, at most six for each heading and turn on the
-    hand-drawn maps. With the constant 1 for straight on and entries of 2, a star disturbs by 1/8, and up to seven are
-    outweighed. A table is good for one map; for maps never seen, use ``HikingEgo-v0``.
+    With the hiker at p and stars at q, a sum with the weights w is ``w[p] + 1/16 * sum of w[q]`` plus a constant of the
+    map: more stars disturb more. The program that ``Hiking-v1`` describes is disturbed by 1/8 for each, and up to seven
+    are outweighed.
 
     $rules
 
     ## Version History
     * v0: initial version; the egocentric observation has become ``HikingEgo-v0``
     """
-
-    grids: ClassVar[tuple[Grid, ...]] = (Grid.whole("map", 0, N_ROWS, N_COLUMNS),)
-
-    def __init__(
-        self,
-        n_stars: int = 3,
-        layout: str | Sequence[str] = "valley",
-        render_mode: str | None = None,
-        context: str = "hidden",
-        observation: None = None,
-        n_done: int | str = 0,
-    ) -> None:
-        _refuse_observation(observation)
-        super().__init__(n_stars, layout, render_mode, context, n_done)
-
-    def _seen(self, numbers: NDArray[np.float32]) -> NDArray[np.float32]:
-        return numbers
 
 
 @with_sections(_SECTIONS, id="HikingEgo-v0")
@@ -301,24 +277,8 @@ class HikingVectorEnv(_WholeMap, PathwayVectorEnv):
         return np.where(self._numbers == self.star_value, share, self._numbers)
 
 
-class HikingV0VectorEnv(_FirstWholeMap, PathwayVectorEnv):
+class HikingV0VectorEnv(_FirstWholeMap, HikingVectorEnv):
     """N :class:`HikingV0Env`; see :class:`PathwayVectorEnv`."""
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        n_stars: int = 3,
-        layout: str | Sequence[str] = "valley",
-        max_episode_steps: int | None = None,
-        context: str = "hidden",
-        observation: None = None,
-        n_done: int | str = 0,
-    ) -> None:
-        _refuse_observation(observation)
-        super().__init__(num_envs, n_stars, layout, max_episode_steps, context, n_done)
-
-    def _observe(self) -> NDArray[np.float32]:
-        return self._numbers.copy()
 
 
 class HikingEgoVectorEnv(_FramedMap, PathwayVectorEnv):
