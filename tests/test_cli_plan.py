@@ -65,9 +65,10 @@ def test_brackets_keep_a_list_together_and_other_commas_give_variations():
     assert parse_variations(["discs=[0,1],[1,0]"]) == [{"discs": [0, 1]}, {"discs": [1, 0]}]
 
 
-def test_where_nothing_is_left_to_do_the_plan_is_empty(plan):
-    code, out, _ = plan("Hanoi-v0", "--set", "n_discs=1", "discs=[2]")
-    assert (code, out) == (0, "step  action\nGoal reached in 0 steps.\n")
+def test_where_nothing_is_left_to_do_there_is_no_plan(plan):
+    code, out, err = plan("Hanoi-v0", "--set", "n_discs=1", "discs=[2]")
+    assert (code, out) == (2, "")
+    assert "nothing is left to be done there" in err
 
 
 @needs_pybullet
