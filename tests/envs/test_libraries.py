@@ -15,10 +15,10 @@ needs_pybullet = pytest.mark.skipif(find_spec("pybullet") is None, reason="pybul
 def test_without_pybullet_all_other_environments_work_and_the_panda_ids_say_what_to_install() -> None:
     code = """
 import sys, warnings
-warnings.simplefilter("ignore", DeprecationWarning)  # of Gymnasium, for ids of which there is a newer version
 sys.modules["pybullet"] = None  # which makes an import of it fail, as if it were not installed
 import gymnasium as gym
 import progpolicy_envs
+warnings.simplefilter("ignore", DeprecationWarning)  # of Gymnasium, for ids of which there is a newer version
 for domain in progpolicy_envs.DOMAINS.values():
     for make in (gym.make, lambda env_id: gym.make_vec(env_id, num_envs=2)):
         try:
