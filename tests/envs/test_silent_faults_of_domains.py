@@ -174,12 +174,11 @@ def test_push_controller_solves_starts_in_the_middle():
 
 def test_a_plan_ends_with_a_failure():
     env = gym.make("PandaPush-v0", reward_type="potential")
-    env.reset(seed=0, options={"starts": [[0.18, 0.0]]})
-    env.unwrapped.task.positions = [(0.9, 0.0, 0.02)]
-    env.unwrapped.scene.positions = [(0.9, 0.0, 0.02)]
+    env.reset(seed=0, options={"starts": [[0.25, 0.0]]})
     assert env.unwrapped.task.out_of_reach
-    env.unwrapped._failed = True
-    assert list(env.unwrapped.plan()) == []
+    steps = [env.step(action) for action in env.unwrapped.plan()]
+    assert [terminated for _, _, terminated, _, _ in steps] == [True]
+    assert steps[0][4]["is_failure"]
     env.reset(seed=0)
     assert next(env.unwrapped.plan()).shape == (4,)
     env.close()

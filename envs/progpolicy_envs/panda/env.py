@@ -16,7 +16,7 @@ from progpolicy_envs.panda.physics import CONTROL_STEP, ObjectState, Physics
 from progpolicy_envs.panda.placement import Points
 from progpolicy_envs.panda.scene import Scene
 from progpolicy_envs.panda.tasks import Task
-from progpolicy_envs.rendering import Display, Frame
+from progpolicy_envs.rendering import Frame
 from progpolicy_envs.single import DomainEnv, require_reset
 from progpolicy_envs.states import check_choice
 from progpolicy_envs.symmetry import Permutation, Symmetry
@@ -81,14 +81,13 @@ class PandaEnv(DomainEnv):
         check_choice("reward_type", reward_type, REWARD_TYPES)
         if not isinstance(physics, Physics | None):
             raise ValueError(f"physics={physics!r} is not accepted; it is a Physics, or None for the default")
+        # Frames are shown in the time that they last.
+        self.metadata = {**self.metadata, "render_fps": round(1 / (physics or Physics()).control_step)}
         super().__init__(variation, self._observed_space(), render_mode, context)
         self.reward_type = reward_type
         self.action_space = spaces.Box(-1.0, 1.0, (len(ACTION_NAMES),), np.float32)
         self.task = self.task_class()
         self.scene = Scene(self.task.table, self.task.kind, physics, visual=render_mode is not None)
-        # Frames are shown in the time that they last.
-        self.metadata = {**self.metadata, "render_fps": round(1 / self.scene.physics.control_step)}
-        self._display = Display(self.metadata["render_fps"])
         self._camera = Camera(self.scene, self.task) if render_mode is not None else None
         self._approach_distance = self._potential = 0.0
         self._failed = False
